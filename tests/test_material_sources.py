@@ -322,6 +322,20 @@ def gltf_with_smaller_maps(folder):
     return path, {**PAINT, **maps}, [f'map "{name}": 4 × 4 texels, interpolated to 8 × 8' for name in maps]
 
 
+@case
+def gltf_with_maps_of_other_proportions(folder):
+    """All maps get the largest width and the largest height."""
+    row = np.arange(16, dtype=np.uint8)[None, :, None] * np.full((2, 1, 3), 10, np.uint8)
+    path = gltf(write(three(folder), orm__png=row))
+    maps = {name: np.broadcast_to(row[:1, :, :1] / 255, (8, 16, 1)) for name in ("roughness", "metallic")}
+    up = 0.5 + 0.5 * np.array([1, 1, 255]) / np.sqrt(2 + 255**2)
+    flat = {"albedo": np.full((8, 16, 3), 40 / 255), "normal": np.broadcast_to(up, (8, 16, 3))}
+    write(
+        folder, color__png=np.full((8, 8, 3), 40, np.uint8), normal__png=np.full((4, 4, 3), [128, 128, 255], np.uint8)
+    )
+    return path, {**flat, **maps}, ['map "albedo": 8 × 8 texels, interpolated to 16 × 8']
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_a_source_is_read(tmp_path, name):
     source, maps, notes = CASES[name](tmp_path)

@@ -61,6 +61,9 @@ _LOOKS_NORMAL = 0.95
 #: Least share of normals among the texels of an image that has the name of a normal map.
 _NAMED_NORMAL = 0.5
 
+#: Largest ratio of the texels of all maps of a model, in one size, to those of its largest image.
+MOST_GROWTH = 16
+
 #: Largest magnitude of a factor.
 MOST_FACTOR = 1e6
 
@@ -141,7 +144,8 @@ def load_source(
     else they are colours). A map of a material is by default sRGB if its name is that of colours and it has 8 or 16
     bits and 1 or 3 channels. In a manifest, its alpha channel is left out if it is 1 everywhere, else ``channels`` is
     needed. A roughness, AO or metallic map with three equal channels keeps one. Normals of DirectX become those of
-    OpenGL. Smaller maps get the size of the largest by linear interpolation, colours in linear light.
+    OpenGL. Smaller maps get the size of the largest by linear interpolation, colours in linear light; those of a model
+    may differ in the ratio of width and height.
 
     NaN and infinite values are an error. With ``nonfinite="clean"`` NaN becomes 0 and infinity the largest (negative:
     the smallest) finite value of the channel, 0 if there is none. Raises :class:`SourceError`.
@@ -164,7 +168,7 @@ def load_source(
             entries, notes = readers[where.suffix.lower()](where, name, images)
             if not constant and all(entry.constant for entry in entries):
                 raise SourceError(f"{shown(where)}: its material has no images that are read, there is nothing to fit")
-            return _load(where, entries, notes, images, nonfinite)
+            return _load(where, entries, notes, images, nonfinite, where.suffix.lower() != ".json")
         image, color_space = images.read(str(where)), None
         values, content = image.values[:, :, : image.colors], COLOURS if image.named else UNKNOWN
         if named and image.named:
@@ -176,7 +180,9 @@ def load_source(
     return _assemble(maps, where, nonfinite, notes, images.nbytes)
 
 
-def _load(path: Path, entries: list[MapEntry], notes: list[str], images: ImageFiles, nonfinite: str) -> Source:
+def _load(
+    path: Path, entries: list[MapEntry], notes: list[str], images: ImageFiles, nonfinite: str, any_ratio: bool = False
+) -> Source:
     """Read the images of a material. Raises :class:`SourceError`."""
     if len(entries) > MAX_CHANNELS:  # of one channel or more, each an image in memory
         raise SourceError(f"{path}: has {len(entries):,} maps, at most {MAX_CHANNELS} channels in all are supported")
@@ -202,7 +208,7 @@ def _load(path: Path, entries: list[MapEntry], notes: list[str], images: ImageFi
             count = 1 if content.role == "normal" else values.shape[2]
             raise SourceError(f"{where} has {len(entry.factor)} factors, allowed are 1 or {count}")
         maps.append(_RawMap(values, replace(entry, content=content)))
-    return _assemble(maps, path, nonfinite, notes, images.nbytes)
+    return _assemble(maps, path, nonfinite, notes, images.nbytes, any_ratio)
 
 
 def _content_of_image(path: Path, values: np.ndarray) -> tuple[Content, list[str]]:
@@ -379,15 +385,24 @@ def _share_of_normals(values: np.ndarray) -> float:
     return float((unit & (normals[..., 2] > 0)).mean())
 
 
-def _assemble(raw: list[_RawMap], where, nonfinite: str, notes: list[str] = (), file_nbytes: int = 0) -> Source:
-    """Return the source of some maps. Raises :class:`SourceError` if they do not go together."""
+def _assemble(
+    raw: list[_RawMap], where, nonfinite: str, notes: list[str] = (), file_nbytes: int = 0, any_ratio: bool = False
+) -> Source:
+    """Return the source of some maps, with ``any_ratio`` of different ratios of width and height.
+
+    Raises :class:`SourceError` if they do not go together.
+    """
     if nonfinite not in NONFINITE:
         raise ValueError(f'nonfinite: found "{nonfinite}", allowed are {NONFINITE}')
     if not raw:
         raise SourceError(f"{where}: has no maps")
     largest = max(raw, key=lambda m: math.prod(m.values.shape[:2]) - m.entry.constant)
     height, width = largest.values.shape[:2]
-    for other in raw:
+    sides = [max(m.values.shape[i] for m in raw) for i in (0, 1)]
+    any_ratio &= math.prod(sides) <= MOST_GROWTH * height * width
+    if any_ratio:  # each covers the unit square of the texture coordinates
+        height, width = sides
+    for other in () if any_ratio else raw:
         rows, columns = other.values.shape[:2]
         if rows * width != columns * height and rows * columns > 1:
             both = [
