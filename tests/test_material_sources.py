@@ -333,7 +333,8 @@ def gltf_with_maps_of_other_proportions(folder):
     write(
         folder, color__png=np.full((8, 8, 3), 40, np.uint8), normal__png=np.full((4, 4, 3), [128, 128, 255], np.uint8)
     )
-    return path, {**flat, **maps}, ['map "albedo": 8 × 8 texels, interpolated to 16 × 8']
+    sizes = {"albedo": "8 × 8", "normal": "4 × 4", "roughness": "16 × 2", "metallic": "16 × 2"}
+    return path, {**flat, **maps}, [f'map "{n}": {size} texels, interpolated to 16 × 8' for n, size in sizes.items()]
 
 
 @pytest.mark.parametrize("name", CASES)
