@@ -339,8 +339,7 @@ class ShadingContenders:
                         views = renders[name][lights][spp]["brightness"]
                         ratios[name] += [abs(ratio - 1) for view in views for ratio in view.values()]
             over = {}
-            for suffix in ("db", "with_noise_db"):
-                error = suffix if suffix != "db" else "footprints_db"
+            for suffix, error in (("db", "footprints_db"), ("with_noise_db", "with_noise_db")):
                 rivals = {"best": self.best("compressed", error=error), "lean": self.best("classical", "LEAN", error)}
                 for name, rival in rivals.items():
                     over[f"over_{name}_{suffix}"] = ours.record["errors"][error] - rival.record["errors"][error]
