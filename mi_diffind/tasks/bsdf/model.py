@@ -347,11 +347,14 @@ class BSDFArrays(nn.Module):
         parts = [None if p is None else p._alloc(dtype)[0] for p in (self.residual, self.proxy, self.mixing)]
         return BSDFArrays(*parts, self.rate), 3
 
-    def logarithms(self) -> list:
-        """Return the logarithms of the parameters of a single proxy, as arrays of one number each."""
+    def logarithms(self, lanes: int = 1) -> list:
+        """Return the logarithms of the parameters of a single proxy, as arrays of ``lanes`` equal numbers each.
+
+        With a number for each sample, one kernel sums all gradients; a number for all samples takes one each.
+        """
         entries = self.proxy.data.array
         index = dr.uint32_array_t(type(entries))
-        return [self.rate * dr.gather(type(entries), entries, index(i)) for i in range(PARAMETERS)]
+        return [self.rate * dr.gather(type(entries), entries, dr.full(index, i, lanes)) for i in range(PARAMETERS)]
 
     def proxy_table(self) -> DifferentiableArray:
         """Return the table of a family's proxy as it is interpolated: colours, and logarithms of all else."""
@@ -363,10 +366,10 @@ class BSDFArrays(nn.Module):
         result.data = type(self.proxy.data)(values, self.proxy.data.shape)
         return result
 
-    def at(self, form: Form, coordinates: Sequence = (), is_rounded: bool = True) -> LearnedBSDF:
+    def at(self, form: Form, coordinates: Sequence = (), is_rounded: bool = True, lanes: int = 1) -> LearnedBSDF:
         """Return the BSDF, or the members of the family at ``coordinates``.
 
-        Entries of the residual are rounded to bytes, or only folded.
+        Entries of the residual are rounded to bytes, or only folded. ``lanes``: see :meth:`logarithms`.
         """
         residual, mixing = self.residual, self.mixing
         if residual is not None and not is_rounded:
@@ -376,9 +379,8 @@ class BSDFArrays(nn.Module):
             mixing = None if mixing is None else mixing.rounded(8)
         if len(coordinates):
             return member(form, self.proxy_table(), residual, mixing, None, coordinates)
-        return LearnedBSDF(
-            form, residual, None if self.proxy is None else Proxy.from_logarithms(self.logarithms(), form)
-        )
+        proxy = None if self.proxy is None else Proxy.from_logarithms(self.logarithms(lanes), form)
+        return LearnedBSDF(form, residual, proxy)
 
 
 class LearnedBSDF:

@@ -196,7 +196,7 @@ class BSDFProblem(Problem):
 
     def value(self, net, s: Samples) -> list:
         """Return f of samples in a step."""
-        return net.at(self.form, s.coordinates, self._share >= ROUNDED).value(s.wi, s.wo)
+        return net.at(self.form, s.coordinates, self._share >= ROUNDED, dr.width(s.weight)).value(s.wi, s.wo)
 
     def loss(self, net, rng, size: int):
         # The samples are in random order: a run of them is a batch, and is read from memory in order
