@@ -24,7 +24,7 @@ NODES = 32
 ANGLES = 4
 
 #: Samples of an angle.
-SAMPLES = 8192
+SAMPLES = 2**15
 
 #: Corrections of the scale; each takes the square root of the excess, since both directions are scaled.
 CORRECTIONS = 40
@@ -40,9 +40,27 @@ BETWEEN = 3
 SWEEPS = 60
 
 
-def contributions(
-    values: list, truth, types, cos: np.ndarray, azimuth: float = 0.0, seed: int = 5, size: int = SAMPLES
-):
+class KroneckerSequence:
+    """Low-discrepancy numbers in the place of a random generator: each call returns one of four dimensions, of ``size``.
+
+    Albedos of a source differ by a fifth of what random numbers leave.
+    """
+
+    #: Root of x⁵ = x + 1, whose powers give the steps of four dimensions.
+    ROOT = 1.1673039782614187
+
+    def __init__(self, size: int):
+        self.size, self.dimension = size, 0
+
+    def random(self, Float: type, lanes: int):
+        """Return the next dimension: numbers in [0, 1), the same for each run of ``size`` lanes."""
+        self.dimension += 1
+        step = int((self.ROOT**-self.dimension % 1) * 2**32)
+        index = dr.arange(dr.uint32_array_t(Float), lanes) % self.size
+        return Float((index * step + 2**31) >> 8) * 2.0**-24
+
+
+def contributions(values: list, truth, types, cos: np.ndarray, azimuth: float = 0.0, size: int = SAMPLES):
     """Return the contributions of samples to the albedos of functions ``value(wi, wo)`` = f cos θ_o.
 
     ``cos``: cosines of ``wi``. Returns the cosines of ``wo``, ``(len(cos), size)``, and for each function an array
@@ -53,7 +71,7 @@ def contributions(
     z = dr.gather(types.Float, types.Float(np.ascontiguousarray(cos, np.float32)), lane)
     sin = dr.sqrt(1 - dr.square(z))
     wi = types.Array3f(sin * float(np.cos(azimuth)), sin * float(np.sin(azimuth)), z)
-    samples = outgoing(dr.rng(seed=dr.opaque(types.UInt64, seed)), types, wi, truth)
+    samples = outgoing(KroneckerSequence(size), types, wi, truth)
     result = []
     with dr.suspend_grad():
         for value in values:
@@ -64,13 +82,13 @@ def contributions(
 
 
 def albedos(
-    values: list, truth, types, cos: np.ndarray, azimuth: float = 0.0, seed: int = 5, size: int = SAMPLES
+    values: list, truth, types, cos: np.ndarray, azimuth: float = 0.0, size: int = SAMPLES
 ) -> np.ndarray:
     """Return the directional albedos of functions ``value(wi, wo)`` = f cos θ_o, from the same samples.
 
     ``cos``: cosines of ``wi``; the result has the shape ``(len(values), len(cos), 3)``.
     """
-    _, parts = contributions(values, truth, types, cos, azimuth, seed, size)
+    _, parts = contributions(values, truth, types, cos, azimuth, size)
     return np.stack([part.mean(axis=1, dtype=np.float64) for part in parts])
 
 
@@ -78,30 +96,15 @@ def fit_scale(value, truth, types, azimuths: tuple[float, ...] = (0.0,)) -> np.n
     """Return s(θ) ≤ 1 at :data:`NODES` cosines, so that s(θ_i) s(θ_o) f has at most the source's albedo + 0.1%.
 
     ``value`` is f cos θ_o of the learned BSDF. s starts at 1; where the albedo is too high in a channel, the nodes next
-    to the angle are lowered, until no angle is left. A black channel may reach :data:`DARK` of the brightest one: no
-    factor lowers it without the others.
+    to the angle are lowered, until no angle is left.
     """
-    fine = np.maximum(np.linspace(0, 1, (NODES - 1) * ANGLES + 1) ** 2, 2e-3)
-    position, nodes = np.sqrt(fine), np.linspace(0, 1, NODES)
-    parts = []
-    for azimuth in azimuths:
-        cos, (source, learned) = contributions([truth.value, value], truth, types, fine, azimuth)
-        albedo = source.mean(axis=1, dtype=np.float64)
-        allowed = np.maximum(ALLOWED * albedo, DARK * albedo.max(axis=1, keepdims=True))
-        parts.append((np.sqrt(np.clip(cos, 0, 1)), allowed, learned))
+    limits = [energy_limit(value, truth, types, azimuth, ANGLES, SAMPLES) for azimuth in azimuths]
     scale = np.ones(NODES)
     for k in range(CORRECTIONS):
-        ratio = np.ones(len(fine))
-        for outgoing_position, allowed, learned in parts:
-            factors = np.interp(outgoing_position, nodes, scale)[..., None]
-            albedo = np.interp(position, nodes, scale)[:, None] * (factors * learned).mean(axis=1)
-            ratio = np.minimum(ratio, (allowed / np.maximum(albedo, 1e-9)).min(axis=1))
-        if ratio.min() >= 1 - 1e-5:
+        factors = lowering(scale, limits, half=k < CORRECTIONS // 2)
+        if factors is None:
             break
-        lowered = np.sqrt(ratio) if k < CORRECTIONS // 2 else ratio
-        for node in range(NODES):
-            near = slice(max(0, (node - 1) * ANGLES + 1), (node + 1) * ANGLES)
-            scale[node] *= lowered[near].min()
+        scale *= factors
     return scale
 
 
@@ -131,36 +134,45 @@ def fit_family_scale(truth, member_at: Callable, types, azimuths: tuple[float, .
     return scale.T.reshape(NODES, *nodes, 1)
 
 
-def energy_limit(value: Callable, source, types, azimuth: float) -> tuple[np.ndarray, np.ndarray]:
+def energy_limit(
+    value: Callable, source, types, azimuth: float, angles: int = MEMBER_ANGLES, size: int = MEMBER_SAMPLES
+) -> tuple[np.ndarray, np.ndarray]:
     """Return albedos of a function ``value(wi, wo)`` = f cos θ_o as a product, and those that are allowed.
 
     ``A``, ``(angles, NODES, 3)``: the albedo at angle i under a scale s is s(θ_i) Σ_k A_ik s_k. Allowed are
-    ``(angles, 3)``. Angles are those of the nodes, and :data:`MEMBER_ANGLES` - 1 between each two.
+    ``(angles, 3)``: the source's, at most 1. A black channel may reach :data:`DARK` of the brightest one: no factor
+    lowers it without the others. Angles are those of the nodes, and ``angles`` - 1 between each two.
     """
     last = NODES - 1
-    fine = np.maximum(np.linspace(0, 1, last * MEMBER_ANGLES + 1) ** 2, 2e-3)
-    cos, (exact, learned) = contributions([source.value, value], source, types, fine, azimuth, size=MEMBER_SAMPLES)
+    fine = np.maximum(np.linspace(0, 1, last * angles + 1) ** 2, 2e-3)
+    cos, (exact, learned) = contributions([source.value, value], source, types, fine, azimuth, size)
     position = np.sqrt(np.clip(cos, 0, 1)) * last
     lower = np.minimum(position.astype(int), last - 1)
     share, row = position - lower, np.arange(len(fine))[:, None] * NODES
     products = np.empty((len(fine), NODES, 3))
     for channel in range(3):
-        x, total = learned[..., channel] / MEMBER_SAMPLES, len(fine) * NODES
+        x, total = learned[..., channel] / size, len(fine) * NODES
         low = np.bincount((row + lower).ravel(), ((1 - share) * x).ravel(), total)
         high = np.bincount((row + lower + 1).ravel(), (share * x).ravel(), total)
         products[..., channel] = (low + high).reshape(len(fine), NODES)
-    return products, ALLOWED * exact.mean(axis=1, dtype=np.float64)
+    albedo = np.minimum(exact.mean(axis=1, dtype=np.float64), 1)
+    return products, np.maximum(ALLOWED * albedo, DARK * albedo.max(axis=1, keepdims=True))
 
 
-def lowering(column: np.ndarray, limits: list) -> np.ndarray | None:
-    """Return the factors of a member's scale ``column``, ``(NODES,)``, that limit its albedo, or ``None``."""
-    at_angles = np.interp(np.linspace(0, 1, len(limits[0][1])), np.linspace(0, 1, NODES), column)
-    ratio = np.ones(len(at_angles))
+def lowering(column: np.ndarray, limits: list, half: bool = True) -> np.ndarray | None:
+    """Return the factors of a scale ``column``, ``(NODES,)``, that limit the albedo, or ``None``.
+
+    ``half``: of an excess (of its logarithm), half is left to the scale of the other direction.
+    """
+    count = len(limits[0][1])
+    angles = (count - 1) // (NODES - 1)
+    at_angles = np.interp(np.linspace(0, 1, count), np.linspace(0, 1, NODES), column)
+    ratio = np.ones(count)
     for products, allowed in limits:
         albedo = at_angles[:, None] * np.einsum("akc,k->ac", products, column)
         ratio = np.minimum(ratio, (allowed / np.maximum(albedo, 1e-9)).min(axis=1))
     if ratio.min() >= 1 - 1e-5:
         return None
-    # Both directions are scaled: half of the excess (of its logarithm) is left to the other
-    wide = np.concatenate([[1] * (MEMBER_ANGLES - 1), np.sqrt(ratio), [1] * (MEMBER_ANGLES - 1)])
-    return np.array([wide[k * MEMBER_ANGLES : (k + 2) * MEMBER_ANGLES - 1].min() for k in range(NODES)])
+    beside = [1] * (angles - 1)
+    wide = np.concatenate([beside, np.sqrt(ratio) if half else ratio, beside])
+    return np.array([wide[k * angles : (k + 2) * angles - 1].min() for k in range(NODES)])

@@ -43,10 +43,15 @@ PASSES = 8
 ENLARGED = 8
 
 
-def albedo_excess(truth: Truth, value, types) -> float:
-    """Return the largest relative difference by which a directional albedo of f cos θ_o lies above the source's."""
+def albedo_figures(truth: Truth, value, types) -> dict[str, float]:
+    """Return figures of the directional albedo of f cos θ_o, from 0° to 89°.
+
+    ``albedo_excess`` is the largest relative difference by which it lies above the source's, ``albedo_largest`` the
+    largest of all.
+    """
     source, learned = energy.albedos([truth.value, value], truth, types, ALBEDO_COSINES)
-    return float(((learned - source) / np.maximum(source, 1e-3)).max())
+    excess = (learned - source) / np.maximum(source, 1e-3)
+    return {"albedo_excess": float(excess.max()), "albedo_largest": float(learned.max())}
 
 
 def weight_moments(truth: Truth, sampling, types, *size: int) -> list[float]:
@@ -57,13 +62,12 @@ def weight_moments(truth: Truth, sampling, types, *size: int) -> list[float]:
 def measure(model, truth: Truth, view: SphereView) -> dict[str, float]:
     """Return figures of a model: PSNR, albedo and sampling.
 
-    ``psnr_db`` is that of the picture of a sphere; ``albedo_excess`` the largest relative difference by which a
-    directional albedo, from 0° to 89°, lies above the source's; ``sample_weight_moment`` the mean of E[w²]/E[w]² of the
-    weights of samples at 0°, 45° and 80°.
+    ``psnr_db`` is that of the picture of a sphere; albedos are those of :func:`albedo_figures`;
+    ``sample_weight_moment`` is the mean of E[w²]/E[w]² of the weights of samples at 0°, 45° and 80°.
     """
     return {
         "psnr_db": view.psnr(model.bsdf.cosine_value),
-        "albedo_excess": albedo_excess(truth, model.bsdf.cosine_value, model.types),
+        **albedo_figures(truth, model.bsdf.cosine_value, model.types),
         "sample_weight_moment": float(np.mean(weight_moments(truth, model.mixture, model.types))),
     }
 
@@ -98,7 +102,7 @@ def measure_family(model, truth: FamilyTruth) -> dict[str, float]:
         values = [p.value(x) for p, x in zip(truth.parameters, coordinates, strict=True)]
         source, (bsdf, sampling) = truth.at(coordinates), model.at(opaque_numbers(types, values))
         psnr.append(SphereView(source, types, side=48, samples=32).psnr(bsdf.cosine_value))
-        excess.append(albedo_excess(source, bsdf.cosine_value, types))
+        excess.append(albedo_figures(source, bsdf.cosine_value, types)["albedo_excess"])
         moments += weight_moments(source, sampling, types, 2**13)
     return {
         "psnr_db": float(np.mean(psnr)),

@@ -24,6 +24,7 @@ from ...measure.report import grid
 from .files import load
 from .fit import use_rgb_variant
 from .functions import is_table
+from .shifted_gamma import read_fits
 from .truth import SUFFIXES, material_ids
 
 #: Material that stands for all of a scene.
@@ -189,7 +190,7 @@ def find_materials(request: FitRequest, folder: Path) -> tuple[dict[str, Library
     files = [source]
     if source.is_dir():
         files = (f for f in source.iterdir() if f.suffix.lower() in SUFFIXES and not f.name.startswith("."))
-        files = sorted(f for f in files if not (f.is_dir() or (f.suffix.lower() == ".npz" and is_table(f))))
+        files = sorted(f for f in files if not f.is_dir() and _may_be_source(f))
         if not files:
             raise UsageError(f"{source}: holds no sources, allowed are files that end in {', '.join(SUFFIXES)}")
     given = {**request.options, **dataclasses.asdict(request.settings)}
@@ -202,7 +203,7 @@ def find_materials(request: FitRequest, folder: Path) -> tuple[dict[str, Library
         try:
             if fault := irregular(file, memory() // 4):
                 raise UsageError(f"{shown(file)}: {fault}")
-            ids = material_ids(file) if file.suffix.lower() in (".npz", ".xml" if every else "") else [""]
+            ids = material_ids(file) if file.suffix.lower() in (".npz", ".json", ".xml" if every else "") else [""]
         except DiffindError as e:
             broken[_free_name(file.stem, names)] = str(e)
             continue
@@ -216,6 +217,16 @@ def find_materials(request: FitRequest, folder: Path) -> tuple[dict[str, Library
                 given, _identity(content, [chosen, *common]),
             )  # fmt: skip
     return materials, broken
+
+
+def _may_be_source(file: Path) -> bool:
+    """Return whether a file with an extension of sources is neither a table file nor JSON without fits."""
+    if file.suffix.lower() == ".npz":
+        return not is_table(file)
+    try:
+        return file.suffix.lower() != ".json" or bool(read_fits(file))
+    except UsageError:
+        return False
 
 
 def _free_name(text: str, names: set[str]) -> str:

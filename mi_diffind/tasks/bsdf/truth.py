@@ -33,9 +33,10 @@ from .measured import (
     value_remarks,
 )
 from .model import MOST_PARAMETERS, Parameter, points, turn
+from .shifted_gamma import ShiftedGammaTruth, read_fits
 
 #: Extensions of files that are sources.
-SUFFIXES = (".xml", ".bsdf", ".pbsdf", ".mbsdf", ".binary", ".csv", ".npz")
+SUFFIXES = (".xml", ".bsdf", ".pbsdf", ".mbsdf", ".binary", ".csv", ".npz", ".json")
 
 #: Beginning of an error of ``mi.load_dict``, which names the plugin of a source.
 NODE = re.compile(r'At dictionary node "root": failed to instantiate bsdf plugin of type "\w+": ')
@@ -278,11 +279,11 @@ def truth_of(
     """Return the source of a BSDF.
 
     ``source`` is a scene or a single BSDF as a file (``.xml``) or as a dictionary of ``mi.load_dict``, a ``mi.BSDF``,
-    a Python function or its name ``module:function``, a file of networks (``.npz``, :mod:`.functions`), a measured file
-    (``.bsdf``, ``.pbsdf``, ``.mbsdf``, ``.binary``), or a table of measurements (``.csv``), whose ``angles`` are
-    degrees or radians ("": as its angles say). ``material`` is the id of a BSDF of a scene, or the name of a network.
-    Spectra of measured files have colours under an ``illuminant`` (:mod:`.measured`; "": D65). Raises
-    :class:`.UsageError`.
+    a Python function or its name ``module:function``, a file of networks (``.npz``, :mod:`.functions`) or of fits
+    (``.json``, :mod:`.shifted_gamma`), a measured file (``.bsdf``, ``.pbsdf``, ``.mbsdf``, ``.binary``), or a table of
+    measurements (``.csv``), whose ``angles`` are degrees or radians ("": as its angles say). ``material`` is the id of
+    a BSDF of a scene, or the name of a network or fit. Spectra of measured files have colours under an ``illuminant``
+    (:mod:`.measured`; "": D65). Raises :class:`.UsageError`.
     """
     import mitsuba as mi
 
@@ -311,6 +312,8 @@ def truth_of(
         return GridTruth(path)
     if suffix == ".npz":
         return NetworkTruth(path, material, types)
+    if suffix == ".json":
+        return ShiftedGammaTruth(path, material, types)
     illuminant = illuminant or ILLUMINANTS[0]
     if suffix == ".pbsdf":
         return PolarisedTruth(path, illuminant)
@@ -411,7 +414,7 @@ def _bsdfs(scene) -> list:
 
 
 def material_ids(path) -> list[str]:
-    """Return the ids of the materials of a scene file, sorted, the names of networks, or ``[""]`` for a single BSDF.
+    """Return the ids of the materials of a scene file, sorted, the names of networks or fits, or ``[""]`` for a single BSDF.
 
     Raises :class:`.UsageError`.
     """
@@ -420,7 +423,8 @@ def material_ids(path) -> list[str]:
     if path.suffix.lower() == ".npz":
         with open_networks(path) as archive:
             return list(archive.members)
-
+    if path.suffix.lower() == ".json":
+        return list(read_fits(path))
     loaded = _load(path, lambda: mi.load_file(str(path), optimize=False))
     ids = sorted({b.id() for b in _bsdfs(loaded) if b.id()}) if isinstance(loaded, mi.Scene) else [""]
     if not ids:
