@@ -47,11 +47,12 @@ def albedo_figures(truth: Truth, value, types) -> dict[str, float]:
     """Return figures of the directional albedo of f cos θ_o, from 0° to 89°.
 
     ``albedo_excess`` is the largest relative difference by which it lies above the source's, ``albedo_largest`` the
-    largest of all.
+    largest of all, ``albedo_largest_source`` that of the source.
     """
     source, learned = energy.albedos([truth.value, value], truth, types, ALBEDO_COSINES)
     excess = (learned - source) / np.maximum(source, 1e-3)
-    return {"albedo_excess": float(excess.max()), "albedo_largest": float(learned.max())}
+    largest = {"albedo_largest": float(learned.max()), "albedo_largest_source": float(source.max())}
+    return {"albedo_excess": float(excess.max()), **largest}
 
 
 def weight_moments(truth: Truth, sampling, types, *size: int) -> list[float]:

@@ -124,14 +124,15 @@ def _fit_single(truth: Truth, request: FitRequest, stop: Event) -> Fitted:
         recorded = _settings(request, result, truth, symmetries, sizes)
         table = to_table(problem.net, form, sampling, weights, scale, recorded)
         measure = (evaluation.measure_samples, validation) if rows else (evaluation.measure, truth, view)
-        _complete(table, request, *measure, limit=limit)
+        unlimited = {} if raw is None or scale is None else {"psnr_unlimited_db": raw}
+        _complete(table, request, *measure, limit=limit | unlimited)
         table.settings |= {"remarks": remarks} if remarks else {}
         return table, scale, raw
 
     result = training.train_last(problem, request, finish, stop)
     table, scale, raw = finish(result)
     if scale is not None:
-        limit, without = ("1", "") if raw is None else ("the source's", f"; {raw:.2f} dB without")
+        limit, without = ("1", "") if raw is None else ("the source's and 1", f"; {raw:.2f} dB without")
         lines.append(f"albedo limited to {limit}: factors down to {scale.min():.4f}{without}")
     left_out = [name for name in TERMS if name not in form.terms]
     if left_out and form.terms:

@@ -413,7 +413,7 @@ def test_sources_are_opened_again(saved, types, tmp_path):
     settings = {"material": "b", "uv": [0.5, 0.5], "source_path": "scene.xml"}
     opened = saved(settings)
     figures, truth = opened.measure(), opened.source()
-    names = {"psnr_db", "albedo_excess", "albedo_largest", "sample_weight_moment"}
+    names = {"psnr_db", "albedo_excess", "albedo_largest", "albedo_largest_source", "sample_weight_moment"}
     assert set(figures) == names and 0 < figures["psnr_db"] < 60
     cosines = [math.cos(math.radians(angle)) for angle in (0, 45, 80)]
     moments = [mixture.second_moment(truth, opened.mixture, types, c, 2**16) for c in cosines]
