@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
+from ...arrays import fast_math
 from .model import half_vector, masking
 
 #: Roughnesses of the GGX lobes from which directions are drawn.
@@ -53,16 +54,17 @@ def density_ggx(wi, wo, alpha_u, alpha_v, gamma=None):
 
     With ``gamma``, the density if its number v is first mapped by :func:`shorten_tail`.
     """
-    half = half_vector(wi, wo)
-    inverse, visible = dr.rcp(dr.squared_norm(half)), masking(wi, dr.square(alpha_u), dr.square(alpha_v))
-    slope = inverse * (dr.square(half.x / alpha_u) + dr.square(half.y / alpha_v) + dr.square(half.z))
-    density = dr.rcp(2 * dr.pi * alpha_u * alpha_v * dr.square(slope) * visible)
+    half, visible = half_vector(wi, wo), masking(wi, dr.square(alpha_u), dr.square(alpha_v))
+    square = dr.square(half.x * dr.rcp(alpha_u)) + dr.square(half.y * dr.rcp(alpha_v)) + dr.square(half.z)
+    product = square * dr.rcp(dr.squared_norm(half)) * visible  # of the slope's factor and masking
+    inverse = dr.rcp(product)
+    density = dr.square(inverse) * visible * dr.rcp(2 * dr.pi * alpha_u * alpha_v)
     if gamma is None:
         return density
-    rest = dr.minimum(half.z * dr.rcp(slope * visible), 1)  # 1 - v of the sample
-    q = dr.fma(2 * dr.rcp(gamma), dr.rcp(rest) - 1, 1)
-    factor = 2 * (1 - dr.rcp(gamma)) * dr.exp2(-gamma * dr.log2(q)) * dr.rcp(dr.square(rest))
-    return density * dr.select(rest > 1e-12, factor, 0)
+    ratio = dr.maximum(product * dr.rcp(dr.maximum(half.z, 1e-12)), 1)  # 1 / (1 - v) of the sample
+    q = dr.fma(2 * dr.rcp(gamma), ratio - 1, 1)
+    factor = 2 * (1 - dr.rcp(gamma)) * fast_math.exp2(-gamma * fast_math.log2(q)) * dr.square(ratio)
+    return density * dr.select(ratio < 1e12, factor, 0)
 
 
 def shorten_tail(v, gamma):
@@ -71,7 +73,8 @@ def shorten_tail(v, gamma):
     At normal incidence, slopes then have the distribution of the proxy's lobes. The map is t / (1 + t) with t = γ/2 ((1
     − v)^(−1/(γ − 1)) − 1), the squared slope over α².
     """
-    t = 0.5 * gamma * (dr.exp2(-dr.log2(dr.maximum(1 - v, 1e-7)) * dr.rcp(gamma - 1)) - 1)
+    power = fast_math.exp2(-fast_math.log2(dr.maximum(1 - v, 1e-7)) * dr.rcp(gamma - 1))
+    t = 0.5 * gamma * (power - 1)
     return t * dr.rcp(1 + t)
 
 

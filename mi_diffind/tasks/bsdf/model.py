@@ -45,6 +45,7 @@ import drjit as dr
 import numpy as np
 from drjit import nn
 
+from ...arrays import fast_math
 from ...arrays.budget import Budget
 from ...arrays.indirection import DifferentiableArray, Indirection, device_array, rounded, unfolded
 from ...arrays.lookup import clamp
@@ -130,8 +131,8 @@ class Form:
 class DirectionPair:
     """Terms that the proxy and the coordinates share; all are even in exchanging ``wi`` and ``wo``.
 
-    ``hx2``, ``hy2`` and ``hz2`` are the squared components of the half vector, which sum to 1, and ``log_hz2`` the
-    logarithm (base 2) of the last; ``cos_d`` = cos θ_d; ``schlick`` = (1 − cos θ_d)⁵.
+    ``hx2``, ``hy2`` and ``hz2`` are the squared components of the half vector, which sum to 1, and ``inverse_hz2`` the
+    reciprocal of the last; ``cos_d`` = cos θ_d; ``schlick`` = (1 − cos θ_d)⁵.
     """
 
     wi: object
@@ -140,7 +141,7 @@ class DirectionPair:
     hx2: object
     hy2: object
     hz2: object
-    log_hz2: object
+    inverse_hz2: object
     cos_d: object
     schlick: object
 
@@ -148,10 +149,11 @@ class DirectionPair:
     def of(cls, wi, wo) -> DirectionPair:
         half = half_vector(wi, wo)
         h2 = dr.squared_norm(half)
-        inverse, cos_d = dr.rcp(h2), dr.minimum(0.5 * dr.sqrt(h2), 1)
+        inverse = dr.rcp(h2)
+        cos_d = dr.minimum(0.5 * dr.sqrt(h2), 1)
         x, y, z = (dr.square(c) * inverse for c in half)
         # Lobes with γ < 2 are infinite at 0
-        return cls(wi, wo, half, x, y, z, dr.log2(dr.maximum(z, 1e-6)), cos_d, _fifth(1 - cos_d))
+        return cls(wi, wo, half, x, y, z, dr.rcp(dr.maximum(z, 1e-6)), cos_d, _fifth(1 - cos_d))
 
 
 def half_vector(wi, wo):
@@ -166,12 +168,11 @@ def _fifth(x):
 
 @dataclass
 class ProxyLobe:
-    """Constants of a microfacet lobe: α² and 2/(γα²), γ, γ − 2, 1/(π α_u α_v), F₀ and F₉₀ − F₀."""
+    """Constants of a microfacet lobe: α² and 2/(γα²), γ, 1/(π α_u α_v), F₀ and F₉₀ − F₀."""
 
     squares: tuple
     slopes: tuple
     gamma: object
-    excess: object
     peak: object
     f0: list
     edge: list
@@ -182,17 +183,18 @@ class ProxyLobe:
         squares, peak = tuple(map(dr.square, alphas)), dr.inv_pi * dr.rcp(alphas[0] * alphas[-1])
         slopes = tuple(2 * dr.rcp(gamma * square) for square in squares)
         edge = [grazing - normal for normal, grazing in zip(f0, f90, strict=True)]
-        return cls(squares, slopes, gamma, gamma - 2, peak, f0, edge)
+        return cls(squares, slopes, gamma, peak, f0, edge)
 
     def value(self, g: DirectionPair) -> list:
         """Return D V F, three arrays."""
-        # q / cos²θ_h = 1 + 2 tan²θ_h / (γα²)
+        # D = cos⁻⁴θ_h (q / cos²θ_h)^−γ, where q / cos²θ_h = 1 + 2 tan²θ_h / (γα²)
         if len(self.slopes) == 1:
             q = dr.fma(g.hx2 + g.hy2, self.slopes[0], g.hz2)
         else:
             q = dr.fma(g.hx2, self.slopes[0], dr.fma(g.hy2, self.slopes[1], g.hz2))
-        d = dr.exp2(dr.fma(self.excess, g.log_hz2, -self.gamma * dr.log2(q))) * self.peak
-        d = d * dr.rcp(masking(g.wi, *self.squares) * masking(g.wo, *self.squares))
+        power = fast_math.exp2(-self.gamma * fast_math.log2(q * g.inverse_hz2))
+        denominator = masking(g.wi, *self.squares) * masking(g.wo, *self.squares)
+        d = power * dr.square(g.inverse_hz2) * self.peak * dr.rcp(denominator)
         return [d * dr.fma(edge, g.schlick, normal) for normal, edge in zip(self.f0, self.edge, strict=True)]
 
 
@@ -408,7 +410,7 @@ class LearnedBSDF:
     def coordinates(self, g: DirectionPair) -> list:
         """Return u, v and w."""
         x, y, inverse = self.terms or self._form_numbers(type(g.cos_d))[:3]
-        u = dr.minimum(dr.log2(1 + dr.fma(g.hx2, x, g.hy2 * y)) * inverse, 1)
+        u = dr.minimum(fast_math.log2(1 + dr.fma(g.hx2, x, g.hy2 * y)) * inverse, 1)
         return [u, dr.sqrt(1 - g.cos_d), coordinate_w(g, self.form)]
 
     def _form_numbers(self, Float) -> Sequence:
@@ -424,7 +426,7 @@ class LearnedBSDF:
         g = DirectionPair.of(rotate(wi, -self.form.angle), rotate(wo, -self.form.angle))
         result = [1, 1, 1] if self.proxy is None else self.proxy.value(g)
         if self.energy is not None:
-            scale = self.energy([dr.sqrt(wi.z)], active)[0] * self.energy([dr.sqrt(wo.z)], active)[0]
+            scale = dr.prod([self.energy([dr.sqrt(w.z)], active)[0] for w in (wi, wo)])
             result = [scale * v for v in result]
         if self.residual is None:
             return result

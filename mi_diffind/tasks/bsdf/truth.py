@@ -414,9 +414,9 @@ def _bsdfs(scene) -> list:
 
 
 def material_ids(path) -> list[str]:
-    """Return the ids of the materials of a scene file, sorted, the names of networks or fits, or ``[""]`` for a single BSDF.
+    """Return the ids of the materials of a scene file, sorted, or the names of networks or fits.
 
-    Raises :class:`.UsageError`.
+    Those of a single BSDF are ``[""]``. Raises :class:`.UsageError`.
     """
     import mitsuba as mi
 
