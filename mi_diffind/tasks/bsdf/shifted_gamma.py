@@ -56,11 +56,12 @@ def read_fits(path: Path) -> dict[str, np.ndarray]:
     """
     try:
         content = json.loads(path.read_text("utf-8"))
-        fits = {str(name): np.array([fit[number] for number in NUMBERS], np.float32) for name, fit in content.items()}
-        valid = bool(fits) and all(f.shape == (len(NUMBERS), 3) and np.isfinite(f).all() for f in fits.values())
     except (OSError, ValueError) as e:
         raise UsageError(f"{path}: cannot be read ({reason(e)})") from None
-    except (AttributeError, KeyError, TypeError):
+    try:
+        fits = {str(name): np.array([fit[number] for number in NUMBERS], np.float32) for name, fit in content.items()}
+        valid = bool(fits) and all(f.shape == (len(NUMBERS), 3) and np.isfinite(f).all() for f in fits.values())
+    except (AttributeError, KeyError, TypeError, ValueError):
         valid = False
     if not valid:
         raise UsageError(

@@ -1,5 +1,6 @@
 """Sources that are functions, networks and grids of measurements, and the error that symmetries impose on them."""
 
+import json
 import os
 import struct
 import sys
@@ -151,6 +152,14 @@ def network(weights, wi, wo):
     return np.maximum(np.exp(x) - 1, 0)
 
 
+def materials_in(folder, types):
+    """Materials of a library's folder, and its sources without any."""
+    task = mi_diffind.fitting.task.tasks()["bsdf"]
+    options = {argument.name: argument.default for argument in task.arguments} | {"source": folder}
+    request = mi_diffind.fitting.task.FitRequest("ours", task.presets["ours"], types, options=options)
+    return library.find_materials(request, folder)
+
+
 def test_networks(types, tmp_path, rng):
     a, b = (0.4 * rng.normal(size=675).astype(np.float32) for _ in range(2))
     np.savez(tmp_path / "nets.npz", **{"x/first": a, "second": b})
@@ -178,13 +187,52 @@ def test_networks(types, tmp_path, rng):
             truth_of(tmp_path / f"{name}.npz", types, material)
     os.mkfifo(tmp_path / "pipe.npz")
     (tmp_path / "folder.xml").mkdir()
-    task = mi_diffind.fitting.task.tasks()["bsdf"]
-    options = {argument.name: argument.default for argument in task.arguments} | {"source": tmp_path}
-    request = mi_diffind.fitting.task.FitRequest("ours", task.presets["ours"], types, options=options)
-    materials, broken = library.find_materials(request, tmp_path)
+    materials, broken = materials_in(tmp_path, types)
     names = {"nets_x_first", "nets_second", *(f"{file}_weights" for file in ("one", "short", "flipped", "large"))}
     assert set(materials) == names and materials["nets_x_first"].material == "x/first"
     assert set(broken) == {"text", "pipe"}
+
+
+def shifted_gamma(numbers, wi, wo):
+    """f of one channel, by the formulas of Bagher et al. 2012 in angles."""
+    half = wi + wo
+    half = half / np.linalg.norm(half, axis=1, keepdims=True)
+    theta_h, theta_d = np.arccos(half[:, 2]), np.arccos(np.sum(wi * half, axis=1))
+    fresnel = numbers["f0"] - numbers["f1"] * np.cos(theta_d) + (1 - numbers["f0"]) * (1 - np.cos(theta_d)) ** 5
+    x = numbers["alpha"] + np.tan(theta_h) ** 2 / numbers["alpha"]
+    slopes = numbers["kap"] * np.exp(-x) * x ** -numbers["p"] / (np.pi * np.cos(theta_h) ** 4)
+    for w in (wi, wo):
+        beyond = np.maximum(np.arccos(w[:, 2]) - numbers["theta0"], 0)
+        masking = 1 + numbers["lambda"] * (1 - np.exp(numbers["c"] * beyond ** numbers["k"]))
+        slopes = slopes * np.clip(masking, 0, 1) / w[:, 2]
+    return (numbers["rhoD"] + numbers["rhoS"] * fresnel * slopes) / np.pi
+
+
+def test_fits_of_the_shifted_gamma_distribution(types, tmp_path, rng):
+    """Values are those of the published formulas; other JSON in a folder is no source, but is refused by itself."""
+    channel = {"rhoD": 0.2, "rhoS": 0.4, "f0": 0.3, "f1": 0.2, "kap": 9.0, "alpha": 0.05, "p": 0.6, "lambda": 2.5,
+               "c": 0.02, "k": 5.0, "theta0": 0.3}  # fmt: skip
+    channels = [{k: v * factor for k, v in channel.items()} for factor in (0.8, 1, 1.1)]
+    fit = {name: [c[name] for c in channels] for name in channel} | {"error": [0, 0, 0]}
+    path = tmp_path / "fits.json"
+    path.write_text(json.dumps({"paint": fit, "steel": fit}))
+    wi, wo = random_directions(rng, 500, 0.05), random_directions(rng, 500, 0.05)
+    expected = np.stack([shifted_gamma(c, wi, wo) for c in channels], axis=1) * wo[:, 2:]
+    truth = truth_of(path, types, "paint")
+    np.testing.assert_allclose(values(truth, types, wi, wo), np.maximum(expected, 0), rtol=2e-4, atol=1e-6)
+    (tmp_path / "report.json").write_text("{}")
+    materials, broken = materials_in(tmp_path, types)
+    assert {m.material for m in materials.values()} == {"paint", "steel"} and not broken
+    for content, material, message in (
+        (json.dumps({"paint": fit, "steel": fit}), "", r"has 2 fits: name one \(material\), they are paint, steel"),
+        (json.dumps({"paint": fit}), "gold", 'found "gold", .*fits.json has no such fit'),
+        (json.dumps({"paint": fit | {"rhoD": [0.1]}}), "", "holds no fits of the shifted gamma distribution"),
+        (json.dumps([1]), "", "holds no fits"),
+        ("{", "", "cannot be read"),
+    ):
+        path.write_text(content)
+        with pytest.raises(UsageError, match=message):
+            truth_of(path, types, material)
 
 
 # -- grids -------------------------------------------------------------------------------------------------------------
