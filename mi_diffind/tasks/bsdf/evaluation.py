@@ -14,7 +14,7 @@ from ...core.files import replacing
 from ...core.threads import threads_for_files
 from . import energy, mixture
 from .directions import Samples, SphereView, incident, outgoing
-from .measured import FunctionTruth, Truth
+from .measured import FunctionTruth, Truth, fitted_part, measure_symmetry
 from .model import opaque_numbers
 from .truth import FamilyTruth
 
@@ -63,12 +63,13 @@ def weight_moments(truth: Truth, sampling, types, *size: int) -> list[float]:
 def measure(model, truth: Truth, view: SphereView) -> dict[str, float]:
     """Return figures of a model: PSNR, albedo and sampling.
 
-    ``psnr_db`` is that of the picture of a sphere; albedos are those of :func:`albedo_figures`;
-    ``sample_weight_moment`` is the mean of E[w²]/E[w]² of the weights of samples at 0°, 45° and 80°.
+    ``psnr_db`` is that of the picture of a sphere; albedos are those of :func:`albedo_figures`, beside those of the
+    part of the source that is fitted (:func:`.measured.fitted_part`); ``sample_weight_moment`` is the mean of E[w²]/E[w]² of the weights of samples at 0°, 45° and 80°.
     """
+    fitted = fitted_part(truth, measure_symmetry(truth, model.types), model.form.azimuth == "mirror")
     return {
         "psnr_db": view.psnr(model.bsdf.cosine_value),
-        **albedo_figures(truth, model.bsdf.cosine_value, model.types),
+        **albedo_figures(fitted, model.bsdf.cosine_value, model.types),
         "sample_weight_moment": float(np.mean(weight_moments(truth, model.mixture, model.types))),
     }
 

@@ -24,9 +24,6 @@ from .model import BYTES, TERMS, ResidualSizes, points, sizes_within
 from .pairs import error_floor
 from .truth import FamilyTruth, is_function, parameter_ranges, recorded_source, truth_of
 
-#: Irreciprocal share of a function beyond which its symmetric part is fitted, and the file says how near that comes.
-ASYMMETRY = 1e-3
-
 #: Members of a family whose pictures are compared during the training.
 VIEWS = 8
 
@@ -85,8 +82,8 @@ def _fit_single(truth: Truth, request: FitRequest, stop: Event) -> Fitted:
             raise UsageError(f"{truth.name}: all of its values are 0, which measures no material")
     else:
         view = SphereView(truth, types)
-        if max(symmetries["reciprocity"], symmetries["mirror"] if azimuth == "mirror" else 0) > ASYMMETRY:
-            trained = measured.symmetric_part(truth, azimuth == "mirror")
+        trained = measured.fitted_part(truth, symmetries, azimuth == "mirror")
+        if trained is not truth:
             limit = {"psnr_symmetric_part_db": view.psnr(trained.value)}
         samples = training.draw(trained, types, training.SAMPLES, settings.seed + 1, isotropic)
         smooth = validation = training.draw(trained, types, training.VALIDATION, settings.seed + 2, isotropic)
@@ -119,7 +116,7 @@ def _fit_single(truth: Truth, request: FitRequest, stop: Event) -> Fitted:
         lobes, weights = mixture.fit_mixture(sampled, types, isotropic, form.scale[1] / form.scale[0])
         raw, scale = None if rows else view.psnr(value), None
         if options["energy"] == "source":
-            scale = energy.fit_scale(value, WHITE if rows else truth, types, azimuths)
+            scale = energy.fit_scale(value, WHITE if rows else trained, types, azimuths)
         sampling = {"lobes": [list(dataclasses.astuple(lobe)) for lobe in lobes]}
         recorded = _settings(request, result, truth, symmetries, sizes)
         table = to_table(problem.net, form, sampling, weights, scale, recorded)

@@ -43,6 +43,9 @@ TOLERANCE = 0.01
 #: Azimuth of the axes of a source below which they count as those of the surface, radians.
 TURN = math.radians(0.5)
 
+#: Share of a function, neither reciprocal nor symmetric, beyond which its symmetric part is fitted.
+ASYMMETRY = 1e-3
+
 #: Largest value f cos θ that counts; a source may exceed it next to the horizon.
 LARGEST = 1e8
 
@@ -195,6 +198,12 @@ def symmetric_part(truth: Truth, mirror: bool) -> FunctionTruth:
         return [sum(channel) / len(terms) for channel in zip(*terms, strict=True)]
 
     return FunctionTruth(truth.name, value, truth if truth.samples else None)
+
+
+def fitted_part(truth: Truth, symmetries: dict[str, float | None], mirror: bool) -> Truth:
+    """Return what is fitted of a source: its symmetric part, if the rest is more than :data:`ASYMMETRY`."""
+    rest = max(symmetries["reciprocity"] or 0, (symmetries["mirror"] or 0) if mirror else 0)
+    return symmetric_part(truth, mirror) if rest > ASYMMETRY else truth
 
 
 def measure_symmetry(truth, types, size: int = 2**16) -> dict[str, float]:
