@@ -1,11 +1,18 @@
-"""Write library.xml, a wall of materials beside what is learned of them, and assets/library/*.xml, their sources.
+"""Write library.xml, a wall of materials beside what is learned of them, and what it needs in assets/library.
 
-The learned files are fitted to the sources by ``mi-diffind fit bsdf scenes/assets/library -o scenes/assets/library``.
+These are the sources (MATERIALS as .xml; with ``--data FOLDER`` networks.npz and fits.json, parts of the data of
+Neural-BRDF and of dj_brdf) and labels.png, with the figures of the learned files. The latter are fitted by
+``mi-diffind fit bsdf scenes/assets/library -o scenes/assets/library``.
 """
 
+import argparse
+import json
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import numpy as np
+from matplotlib import get_data_path
+from PIL import Image, ImageDraw, ImageFont
 from scene_xml import element, environment, head, plugin, principled, softbox, transform, write
 
 
@@ -24,7 +31,7 @@ def blend(weight: float, first: ET.Element, second: ET.Element):
     return plugin("bsdf", "blendbsdf", first, second, weight=weight)
 
 
-#: Name → BSDF, row by row.
+#: Name → BSDF.
 MATERIALS = {
     "lacquer": principled(base_color=(0.7, 0.2, 0.08), roughness=0.35, metallic=0.2, clearcoat=1.0),
     "plastic": plastic(0.1, (0.1, 0.27, 0.36), nonlinear=True),
@@ -44,38 +51,103 @@ MATERIALS = {
     "verdigris": blend(0.45, plugin("bsdf", "diffuse", reflectance=(0.15, 0.45, 0.38)), metal("Cu", 0.25)),
 }  # fmt: skip
 
-COLUMNS, RADIUS = 4, 0.45
+#: Name of a file → names of networks, in the file and in nbrdf_weights.npz.
+NETWORKS = {
+    "alum_bronze": "merl/alum-bronze",
+    "satin_purple": "rgl/satin_purple_rgb",
+    "golden_yellow": "rgl/vch_golden_yellow_rgb",
+    "glossy_paper": "nielsen/glossyredpaper",
+}
+
+#: Fits of the shifted gamma distribution in merl_sgd.json.
+FITS = ("blue-metallic-paint", "green-acrylic", "pink-jasper", "gold-paint")
+
+#: Rows of the wall: heading → learned files.
+ROWS = {
+    "plugins": ("lacquer", "gilded", "aluminium", "pearl"),
+    "networks": tuple(f"networks_{name}" for name in NETWORKS),
+    "fits": tuple(f"fits_{name}" for name in FITS),
+}
+
+COLUMNS, RADIUS, SPACING = 4, 0.45, 1.3
+
+#: Albedo of the wall, and pixels of a label for each unit of length.
+WALL, PIXELS = 0.35, 220
+
+SCENES = Path(__file__).resolve().parent
+LIBRARY = SCENES / "assets" / "library"
 
 ABOUT = f"""A library: of each pair of balls, the left one has the material, the right one what was learned of it in two
-kilobytes. Written by make_library.py: change that file, not this one.
+kilobytes. Below: name, bytes, and PSNR of a lit sphere. Written by make_library.py: change that file, not this one.
 
-Rows: {"; ".join(", ".join(list(MATERIALS)[k : k + COLUMNS]) for k in range(0, len(MATERIALS), COLUMNS))}."""
+Rows: plugins of Mitsuba, {", ".join(ROWS["plugins"])}; networks of Neural-BRDF, {", ".join(NETWORKS)};
+fits of measured materials by the shifted gamma distribution, {", ".join(FITS)}."""
 
 
-def pair(index: int, name: str, material: ET.Element):
+def pair(column: int, row: int, name: str):
     """Yield the ball of a material, and that of its file."""
-    column, row = index % COLUMNS, index // COLUMNS
-    learned = plugin("bsdf", "neural_bsdf", id=f"{name}_learned", filename=f"assets/library/{name}.npz")
-    named = ET.Element("bsdf", {**material.attrib, "id": name})
-    named.extend(material)
-    for side, bsdf in ((-0.5, named), (0.5, learned)):
-        centre = element("point", name="center", x=2.3 * (column - 1.5) + side, y=1.15 * (1 - row), z=0.5)
+    for side, evaluate in ((-0.5, "source"), (0.5, "learned")):
+        centre = element("point", name="center", x=2.3 * (column - 1.5) + side, y=SPACING * (1 - row) + 0.1, z=0.5)
+        file = {"filename": f"assets/library/{name}.npz", "evaluate": evaluate}
+        bsdf = plugin("bsdf", "neural_bsdf", id=name if evaluate == "source" else f"{name}_learned", **file)
         yield plugin("shape", "sphere", centre, bsdf, radius=RADIUS)
+
+
+def label_strip(row: int):
+    """Return the rectangle below a row of balls that shows its part of the labels."""
+    lower = 1 - (row + 1) / len(ROWS)
+    shown = transform("to_uv", scale={"x": 1, "y": 1 / len(ROWS)}, translate={"y": lower})
+    texture = plugin("texture", "bitmap", shown, name="reflectance", filename="assets/library/labels.png")
+    place = transform(scale={"x": 4.6, "y": 0.09}, translate={"y": SPACING * (1 - row) - 0.51, "z": 0.02})
+    return plugin("shape", "rectangle", place, plugin("bsdf", "diffuse", texture))
+
+
+def write_labels() -> None:
+    """Write labels.png: name, bytes and PSNR of the learned files, row by row, dark on the wall's albedo."""
+    from mi_diffind.tasks.bsdf.files import load
+
+    width, height = round(9.2 * PIXELS), round(0.18 * PIXELS)
+    font = ImageFont.truetype(str(Path(get_data_path(), "fonts/ttf/DejaVuSans.ttf")), 27)
+    wall = 1.055 * WALL ** (1 / 2.4) - 0.055  # sRGB
+    image = Image.new("L", (width, height * len(ROWS)), round(255 * wall))
+    draw = ImageDraw.Draw(image)
+    for row, names in enumerate(ROWS.values()):
+        for column, name in enumerate(names):
+            table = load(LIBRARY / f"{name}.npz")
+            title = name.removeprefix("networks_").removeprefix("fits_").replace("_", " ").replace("-", " ")
+            text = f"{title}: {table.nbytes:,} bytes, {table.measured['psnr_db']:.1f} dB"
+            place = (width / 2 + 2.3 * (column - 1.5) * PIXELS, (row + 0.5) * height)
+            draw.text(place, text, font=font, fill=8, anchor="mm")
+    image.save(LIBRARY / "labels.png", optimize=True)
+
+
+def write_data(folder: Path) -> None:
+    """Write networks.npz and fits.json, from nbrdf_weights.npz and merl_sgd.json in ``folder``."""
+    with np.load(folder / "nbrdf_weights.npz") as weights:
+        np.savez(LIBRARY / "networks.npz", **{name: weights[key] for name, key in NETWORKS.items()})
+    fits = json.loads((folder / "merl_sgd.json").read_text("utf-8"))
+    (LIBRARY / "fits.json").write_text(json.dumps({name: fits[name] for name in FITS}, indent=1) + "\n", "utf-8")
 
 
 def main() -> None:
     """Write the files."""
-    scenes = Path(__file__).resolve().parent
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, metavar="FOLDER", help="with nbrdf_weights.npz and merl_sgd.json")
+    data = parser.parse_args().data
+    LIBRARY.mkdir(exist_ok=True, parents=True)
+    if data:
+        write_data(data)
     for name, material in MATERIALS.items():
         source = ET.Element("bsdf", {"version": "3.0.0", **material.attrib})
         source.extend(material)
         ET.indent(source, "    ")
-        path = scenes / "assets" / "library" / f"{name}.xml"
-        path.parent.mkdir(exist_ok=True, parents=True)
+        path = LIBRARY / f"{name}.xml"
         path.write_text(ET.tostring(source, encoding="unicode") + "\n", encoding="utf-8", newline="\n")
-    wall = plugin("bsdf", "diffuse", reflectance=(0.35, 0.35, 0.35))
+    if all((LIBRARY / f"{name}.npz").exists() for names in ROWS.values() for name in names):
+        write_labels()
+    wall = plugin("bsdf", "diffuse", reflectance=(WALL, WALL, WALL))
     content = [
-        *head(1000, 400, {}, fov=22.0, camera=((0, 1.5, 24), (0, -0.05, 0))),
+        *head(1000, 420, {}, fov=22.0, camera=((0, 1.5, 24), (0, -0.05, 0))),
         "A hotel room by day",
         environment("interior.exr", scale=0.8, angle=200),
         "A softbox above on the left",
@@ -83,9 +155,11 @@ def main() -> None:
         "The wall",
         plugin("shape", "rectangle", transform(scale={"x": 20, "y": 20}), wall),
     ]
-    for index, (name, material) in enumerate(MATERIALS.items()):
-        content += [name.capitalize(), *pair(index, name, material)]
-    write(scenes / "library.xml", ABOUT, content)
+    for row, (heading, names) in enumerate(ROWS.items()):
+        content += [heading.capitalize(), label_strip(row)]
+        for column, name in enumerate(names):
+            content += pair(column, row, name)
+    write(SCENES / "library.xml", ABOUT, content)
 
 
 if __name__ == "__main__":

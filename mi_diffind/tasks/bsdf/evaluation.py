@@ -64,7 +64,8 @@ def measure(model, truth: Truth, view: SphereView) -> dict[str, float]:
     """Return figures of a model: PSNR, albedo and sampling.
 
     ``psnr_db`` is that of the picture of a sphere; albedos are those of :func:`albedo_figures`, beside those of the
-    part of the source that is fitted (:func:`.measured.fitted_part`); ``sample_weight_moment`` is the mean of E[w²]/E[w]² of the weights of samples at 0°, 45° and 80°.
+    part of the source that is fitted (:func:`.measured.fitted_part`); ``sample_weight_moment`` is the mean of
+    E[w²]/E[w]² of the weights of samples at 0°, 45° and 80°.
     """
     fitted = fitted_part(truth, measure_symmetry(truth, model.types), model.form.azimuth == "mirror")
     return {
