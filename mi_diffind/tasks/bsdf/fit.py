@@ -71,7 +71,7 @@ def _fit_single(truth: Truth, request: FitRequest, stop: Event) -> Fitted:
     with dr.suspend_grad():
         rows = not truth.function
         symmetries = measured.measure_row_symmetry(truth) if rows else measured.measure_symmetry(truth, types)
-    isotropic, azimuth = _assumed_symmetry(symmetries)
+    isotropic, azimuth = _assumed_symmetry(symmetries, rows)
     lines = [*filter(None, [truth.remark]), symmetry_line(symmetries)]
     sizes = _sizes(request, plain=request.preset in ("table", "plain"))
     limit, trained = {}, truth
@@ -182,10 +182,11 @@ def _fit_family(truth: FamilyTruth, request: FitRequest, stop: Event) -> Fitted:
     return Fitted(table, result, lines, {**_figures(table, symmetries), "family": described})
 
 
-def _assumed_symmetry(symmetries: dict[str, float | None]) -> tuple[bool, str]:
+def _assumed_symmetry(symmetries: dict[str, float | None], rows: bool = False) -> tuple[bool, str]:
     """Return whether a source counts as isotropic, and what its residual assumes of the azimuth."""
-    isotropic, mirror = ((symmetries[name] or 0) <= measured.TOLERANCE for name in ("isotropy", "mirror"))
-    return isotropic, "mirror" if mirror else "half"
+    isotropic = (symmetries["isotropy"] or 0) <= measured.TOLERANCE
+    tolerance = measured.MIRROR_TOLERANCE if isotropic and not rows else measured.TOLERANCE
+    return isotropic, "mirror" if (symmetries["mirror"] or 0) <= tolerance else "half"
 
 
 def _sizes(request: FitRequest, parameters=(), plain: bool = False) -> ResidualSizes:

@@ -40,6 +40,10 @@ from .training import proxy_array, residual_range
 #: Relative difference up to which a symmetry is assumed.
 TOLERANCE = 0.01
 
+#: That of an isotropic function about the plane of incidence: trained networks are off by up to 7%, and the arrays
+#: have twice the entries for an azimuth then.
+MIRROR_TOLERANCE = 0.1
+
 #: Azimuth of the axes of a source below which they count as those of the surface, radians.
 TURN = math.radians(0.5)
 
