@@ -69,7 +69,7 @@ ROWS = {
     "fits": tuple(f"fits_{name}" for name in FITS),
 }
 
-COLUMNS, RADIUS, SPACING = 4, 0.45, 1.3
+COLUMNS, RADIUS, SPACING = 4, 0.45, 1.42
 
 #: Albedo of the wall, and pixels of a label for each unit of length.
 WALL, PIXELS = 0.35, 220
@@ -86,19 +86,29 @@ fits of measured materials by the shifted gamma distribution, {", ".join(FITS)}.
 
 def pair(column: int, row: int, name: str):
     """Yield the ball of a material, and that of its file."""
-    for side, evaluate in ((-0.5, "source"), (0.5, "learned")):
-        centre = element("point", name="center", x=2.3 * (column - 1.5) + side, y=SPACING * (1 - row) + 0.1, z=0.5)
-        file = {"filename": f"assets/library/{name}.npz", "evaluate": evaluate}
-        bsdf = plugin("bsdf", "neural_bsdf", id=name if evaluate == "source" else f"{name}_learned", **file)
+    file = {"filename": f"assets/library/{name}.npz"}
+    if name in MATERIALS:
+        source = ET.Element("bsdf", {**MATERIALS[name].attrib, "id": name})
+        source.extend(MATERIALS[name])
+    else:
+        source = plugin("bsdf", "neural_bsdf", id=name, evaluate="source", **file)
+    learned = plugin("bsdf", "neural_bsdf", id=f"{name}_learned", **file)
+    for side, bsdf in ((-0.5, source), (0.5, learned)):
+        centre = element("point", name="center", x=2.3 * (column - 1.5) + side, y=height(row), z=0.5)
         yield plugin("shape", "sphere", centre, bsdf, radius=RADIUS)
+
+
+def height(row: int) -> float:
+    """Return the height of the centres of a row's balls."""
+    return SPACING * (1 - row) + 0.13
 
 
 def label_strip(row: int):
     """Return the rectangle below a row of balls that shows its part of the labels."""
-    lower = 1 - (row + 1) / len(ROWS)
-    shown = transform("to_uv", scale={"x": 1, "y": 1 / len(ROWS)}, translate={"y": lower})
+    share = 1 / len(ROWS)
+    shown = transform("to_uv", scale={"x": 1, "y": -share}, translate={"y": (row + 1) * share})
     texture = plugin("texture", "bitmap", shown, name="reflectance", filename="assets/library/labels.png")
-    place = transform(scale={"x": 4.6, "y": 0.09}, translate={"y": SPACING * (1 - row) - 0.51, "z": 0.02})
+    place = transform(scale={"x": 4.6, "y": 0.14}, translate={"y": height(row) - 0.65, "z": 0.002})
     return plugin("shape", "rectangle", place, plugin("bsdf", "diffuse", texture))
 
 
@@ -106,18 +116,19 @@ def write_labels() -> None:
     """Write labels.png: name, bytes and PSNR of the learned files, row by row, dark on the wall's albedo."""
     from mi_diffind.tasks.bsdf.files import load
 
-    width, height = round(9.2 * PIXELS), round(0.18 * PIXELS)
-    font = ImageFont.truetype(str(Path(get_data_path(), "fonts/ttf/DejaVuSans.ttf")), 27)
+    width, line = round(9.2 * PIXELS), round(0.14 * PIXELS)
+    font = ImageFont.truetype(str(Path(get_data_path(), "fonts/ttf/DejaVuSans.ttf")), 28)
     wall = 1.055 * WALL ** (1 / 2.4) - 0.055  # sRGB
-    image = Image.new("L", (width, height * len(ROWS)), round(255 * wall))
+    image = Image.new("L", (width, 2 * line * len(ROWS)), round(255 * wall))
     draw = ImageDraw.Draw(image)
     for row, names in enumerate(ROWS.values()):
         for column, name in enumerate(names):
             table = load(LIBRARY / f"{name}.npz")
             title = name.removeprefix("networks_").removeprefix("fits_").replace("_", " ").replace("-", " ")
-            text = f"{title}: {table.nbytes:,} bytes, {table.measured['psnr_db']:.1f} dB"
-            place = (width / 2 + 2.3 * (column - 1.5) * PIXELS, (row + 0.5) * height)
-            draw.text(place, text, font=font, fill=8, anchor="mm")
+            lines = title, f"{table.nbytes:,} bytes, {table.measured['psnr_db']:.1f} dB"
+            for k, text in enumerate(lines):
+                place = (width / 2 + 2.3 * (column - 1.5) * PIXELS, (2 * row + k + 0.5) * line)
+                draw.text(place, text, font=font, fill=8, anchor="mm")
     image.save(LIBRARY / "labels.png", optimize=True)
 
 
@@ -147,7 +158,7 @@ def main() -> None:
         write_labels()
     wall = plugin("bsdf", "diffuse", reflectance=(WALL, WALL, WALL))
     content = [
-        *head(1000, 420, {}, fov=22.0, camera=((0, 1.5, 24), (0, -0.05, 0))),
+        *head(1000, 460, {}, fov=22.0, camera=((0, 1.5, 24), (0, -0.05, 0))),
         "A hotel room by day",
         environment("interior.exr", scale=0.8, angle=200),
         "A softbox above on the left",
