@@ -485,7 +485,7 @@ def _from_stock(node: StockNode) -> str | None:
         inner.allow(parameter)
         (inner,) = nested
     images = {**inner.children, **images}
-    if "bitmap" not in [child.name for child in images.values() if child]:
+    if "bitmap" not in node.nested_types(mi.ObjectType.Texture):
         return None
     check_principled(inner)
     for child in (inner, *filter(None, images.values())):
