@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from mi_diffind.commands.cli import main
-from mi_diffind.core.files import CACHE
+from mi_diffind.core.files import CACHE, OutputError
 from mi_diffind.maps.entries import SourceError
 from mi_diffind.maps.source import load_source
 from mi_diffind.scenes import conversion, loading
@@ -131,6 +131,10 @@ def test_names_that_are_missing_long_or_taken(mi_rgb, tmp_path):
     scene = loading.load(model_scene(write(tmp_path / "m.glb", content, data), tmp_path / "parts"))
     bsdfs = [s.bsdf() for s in scene.shapes() if "PLY" in s.class_name()]
     assert len({b.id() for b in bsdfs}) == len(names) and load_source(f"{tmp_path}/m.glb#A3", constant=True)
+    content["meshes"][0]["name"] = "Other"
+    with pytest.raises(OutputError, match=r"new_model: holds Card_0\.ply, which is not of other\.glb: remove"):
+        conversion.convert(write(tmp_path / "other.glb", content, data), new, progress=False)
+    assert {file.name for file in (tmp_path / "new_model").iterdir()} == names and new.read_text() == text
     assert {float(mi_rgb.traverse(b)["roughness.value"][0]) for b in bsdfs} == {i / 8 for i in range(len(names))}
 
 

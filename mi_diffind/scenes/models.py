@@ -18,7 +18,7 @@ import numpy as np
 from .. import plugins
 from ..core import compat
 from ..core.errors import DiffindError, missing_package, reason
-from ..core.files import cache_folder, shown, writable_folder
+from ..core.files import OutputError, cache_folder, shown, writable_folder
 from ..core.units import check_memory
 from ..maps.entries import SourceError
 from ..maps.gltf import material_names, read_content
@@ -87,7 +87,8 @@ def model_scene(path: str | os.PathLike, folder: str | os.PathLike | None = None
     """Write a model as a scene, with its meshes and images, and return the path of the scene file.
 
     - ``path``: a glTF file. Its materials are those that :func:`.load_source` reads; notes on the rest are warnings.
-    - ``folder``: folder of the scene, which is made (``None``: one of the user's cache, by the content of the file).
+    - ``folder``: folder of the scene, which is made and holds no other files (``None``: one of the user's cache, by the
+      content of the file).
 
     Images have 8 bits a channel. Raises :class:`.SourceError` and :class:`.OutputError`.
     """
@@ -100,7 +101,11 @@ def model_scene(path: str | os.PathLike, folder: str | os.PathLike | None = None
         if folder is None and (target / "scene.xml").is_file():
             return target / "scene.xml"
         with tempfile.TemporaryDirectory(dir=writable_folder(target, create=True), prefix=".unfinished") as temporary:
-            for file in _Writer(path, content, Path(temporary)).write():  # the scene last
+            files = _Writer(path, content, Path(temporary)).write()
+            others = {file.name for file in target.glob("[!.]*")} - {file.name for file in files}
+            if others:
+                raise OutputError(f"{target}: holds {min(others)}, which is not of {path.name}: remove the folder")
+            for file in files:  # the scene last
                 os.replace(file, target / file.name)
     except DiffindError:
         raise
