@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_diffind.core import compat
-from mi_diffind.maps.layout import Layout, MapLayout, common_transform
+from mi_diffind.maps.layout import Layout, MapLayout, different_transforms
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.decoder import Lobe
 from mi_diffind.tasks.disney.model import PARAMETERS, clamp
@@ -87,10 +87,8 @@ def material_maps(layout: Layout, ignored: tuple[str, ...] = ()) -> tuple[dict[s
             maps[parameter] = m
     if not maps:
         raise RuntimeError(f'parameter "filename": no map is left to read, the file holds {", ".join(layout.names)}')
-    try:
-        common_transform(maps.values())
-    except ValueError as e:
-        raise RuntimeError(f'parameter "filename": {e}: read each by a neural_texture') from None
+    if fault := different_transforms(maps.values()):
+        raise RuntimeError(f'parameter "filename": {fault}: read each by a neural_texture')
     return maps, left_out
 
 

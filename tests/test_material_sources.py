@@ -596,7 +596,8 @@ def test_a_material_of_a_gltf_file_is_fitted(mi_rgb, tmp_path, monkeypatch, caps
     turned = {"KHR_texture_transform": {"offset": [0.25, 0.5]}}
     textures = {name: {**texture, "extensions": turned} for name, texture in pbr().items()}
     normal = {"index": 1, "extensions": turned}
-    path = gltf(three(tmp_path), count=2, pbrMetallicRoughness=textures, normalTexture=normal, doubleSided=True)
+    more = {"pbrMetallicRoughness": textures, "normalTexture": normal, "doubleSided": True}
+    path = gltf(write(three(tmp_path), color__png=DEEP), count=2, **more)
     options = {"steps": 2, "batch": 256, "compression": 2, **({"shading": "off"} if task == "texture" else {})}
     fitted = mi_diffind.fit(task, f"{path.name}#paint1", **options)
     printed = capsys.readouterr().out
@@ -611,10 +612,11 @@ def test_a_material_of_a_gltf_file_is_fitted(mi_rgb, tmp_path, monkeypatch, caps
     assert described["double_sided"] and described["maps"]["albedo"]["transform"] == [1, 0, 0.25, 0, 1, 0.5]
     assert "uv transform [1 0 0.25, 0 1 0.5]" in lines[2] and "  the material is double-sided" in lines
     # The exact counterparts read the same material
-    props = mi_rgb.Properties(f"neural_{task}")
-    props["filename"], props["channels"] = str(tmp_path / "a.npz"), "roughness"
-    to_bitmap(tasks()[task], props)
-    np.testing.assert_array_equal(np.array(props["bitmap"]).squeeze(), ORM[..., 1])
+    for name, values in (("albedo", unit(DEEP)), ("roughness", ORM[..., 1:2])):
+        props = mi_rgb.Properties(f"neural_{task}")
+        props["filename"], props["channels"] = str(tmp_path / "a.npz"), name
+        to_bitmap(tasks()[task], props)
+        np.testing.assert_allclose(np.array(props["bitmap"]), values, rtol=1e-6)
     to_mipmap(tasks()[task], props)
     texture = {"type": "mipmap", "channels": "roughness", "filename": props["filename"], "filter": "off"}
     si = mi_rgb.SurfaceInteraction3f()

@@ -8,6 +8,7 @@ import json
 import os
 import struct
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import unquote_to_bytes
 
@@ -16,16 +17,7 @@ from ..core.errors import reason
 from ..core.files import RecordedKeys, shown, unused_note
 from ..core.units import memory
 from ..images.reader import PictureError, read_file
-from .entries import (
-    IDENTITY,
-    ImageFiles,
-    MapEntry,
-    SourceError,
-    choose_material,
-    to_transform,
-    transparent,
-    uv_matrix,
-)  # fmt: skip
+from .entries import ImageFiles, MapEntry, SourceError, choose_material, to_transform, transparent, uv_matrix
 
 #: Extension that transforms texture coordinates.
 TRANSFORM = "KHR_texture_transform"
@@ -119,18 +111,19 @@ class _Reader:
                 factor = tuple(factors.get(name, [1.0]))
                 if name in files:
                     space, factor = "srgb" if name == "albedo" else "linear", () if set(factor) == {1.0} else factor
-                    more = {"factor": factor, "opaque": True, "transform": transforms[name]}
-                    entries.append(MapEntry(name, files[name], None, channels, space, **more))
+                    entry = MapEntry(name, files[name], None, channels, space, factor=factor, opaque=True)
+                    entries.append(replace(entry, transform=transforms[name]))
                 elif name not in left_out and name not in ("normal", "ao"):
                     entries.append(MapEntry(name, color_space="linear", factor=factor, constant=True))
-        entries += self._opacity(material, files.get("albedo"), alpha, transforms.get("albedo", IDENTITY))
+        for entry in self._opacity(material, files.get("albedo"), alpha):
+            entries.append(entry if entry.constant else replace(entry, transform=transforms["albedo"]))
         strength = (material.get("occlusionTexture") or {}).get("strength", 1)
         self.notes += [f"occlusionTexture: its strength {strength:g} is not used"] if strength != 1 else []
         self.notes += [f"{name} is not used" for name in material.pop("extensions", {})]
         note = unused_note(self.path, material)
         return entries, self.notes + ([note] if note else [])
 
-    def _opacity(self, material: dict, file: str | None, alpha: float, transform: tuple) -> list[MapEntry]:
+    def _opacity(self, material: dict, file: str | None, alpha: float) -> list[MapEntry]:
         """Return the map of opacity, if the material has one."""
         mode, cutoff = material.get("alphaMode", "OPAQUE"), material.get("alphaCutoff", 0.5)
         has_alpha = file is not None and self.images.read(file).has_alpha
@@ -141,8 +134,7 @@ class _Reader:
         cutoff = float(cutoff) if mode == "MASK" else None
         if has_alpha:
             factor = () if alpha == 1 else (alpha,)
-            more = {"factor": factor, "cutoff": cutoff, "transform": transform}
-            return [MapEntry("opacity", file, None, "a", "linear", **more)]
+            return [MapEntry("opacity", file, None, "a", "linear", factor=factor, cutoff=cutoff)]
         alpha = alpha if cutoff is None else float(alpha >= cutoff)
         return [MapEntry("opacity", color_space="linear", factor=(alpha,), constant=True)] if alpha < 1 else []
 

@@ -7,6 +7,7 @@ stored channels, each scaled to [0, 1], and the origin of each channel of each m
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -68,10 +69,9 @@ class MapLayout:
 
     def to_json(self) -> dict:
         """Return the entry of a table file's settings."""
-        entry = {("kind" if k == "role" else k): v for k, v in asdict(self).items()}
+        entry = {("kind" if k == "role" else k): v for k, v in asdict(self).items() if v != IDENTITY}
         entry["where"] = [list(w) if isinstance(w, tuple) else w for w in self.where]
-        entry["transform"] = list(self.transform)
-        return entry if self.transform != IDENTITY else {k: v for k, v in entry.items() if k != "transform"}
+        return entry
 
     def encode(self, values):
         """Return the stored numbers in [0, 1] of ``values``; values beyond the range of the map become its ends."""
@@ -250,14 +250,13 @@ class Layout:
         return Layout(width, height, tuple(maps), initial, groups, settings.get("double_sided", False) is True)
 
 
-def common_transform(maps: Iterable[MapLayout]) -> tuple[float, ...]:
-    """Return the texture transform of all maps that vary. Raises ``ValueError`` if they differ."""
-    varying = [m for m in maps if m.varies]
-    for m in varying:
-        if m.transform != varying[0].transform:
-            pair = " and ".join(f'"{x.name}" ({describe_transform(x.transform) or "none"})' for x in (varying[0], m))
-            raise ValueError(f"the maps {pair} differ in their texture transforms")
-    return varying[0].transform if varying else IDENTITY
+def different_transforms(maps: Iterable[MapLayout]) -> str:
+    """Return a clause that names two of the maps which vary and have different texture transforms, "" without such."""
+    for first, m in itertools.pairwise(m for m in maps if m.varies):
+        if m.transform != first.transform:
+            pair = " and ".join(f'"{x.name}" ({describe_transform(x.transform) or "none"})' for x in (first, m))
+            return f"the maps {pair} differ in their texture transforms"
+    return ""
 
 
 def _where(w, stored: int):

@@ -189,7 +189,7 @@ def to_bitmap(task: Task, props: mi.Properties) -> None:
     original, layout = find_original(task, props)
     values = _values(original, layout)
     # Bytes stay bytes; 16 bits become float32, since "bitmap" would reduce them to half precision
-    bitmap = mi.Bitmap(np.rint(values * 255).astype(np.uint8) if layout.depth == 1 else np.ascontiguousarray(values))
+    bitmap = mi.Bitmap(np.rint(values * 255).astype(np.uint8) if layout.depth == 1 else np.array(values, order="C"))
     bitmap.set_srgb_gamma(layout.color_space == "srgb")
     props["bitmap"] = bitmap
     if layout.transform != IDENTITY:

@@ -8,7 +8,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from mi_diffind.maps.layout import NORMAL_FLOOR_DB, Layout, MapLayout, common_transform
+from mi_diffind.maps.layout import NORMAL_FLOOR_DB, Layout, MapLayout, different_transforms
 from mi_diffind.maps.pyramid import root
 from mi_diffind.maps.source import from_arrays
 
@@ -221,9 +221,10 @@ def test_json_round_trip():
         damaged["maps"][0]["transform"] = transform
         with pytest.raises((TypeError, ValueError, OverflowError)):
             Layout.from_json(damaged)
-    with pytest.raises(ValueError, match=r'"albedo" \(none\) and "normal" \(uv transform .*differ in their'):
-        common_transform(changed.maps)
-    assert common_transform((placed, MAPS[5])) == placed.transform  # the last map is constant
+    assert different_transforms(changed.maps) == (
+        'the maps "albedo" (none) and "normal" (uv transform [2 0 0.25, 0.5 -1 1]) differ in their texture transforms'
+    )
+    assert not different_transforms((placed, MAPS[5]))  # the last map is constant
 
 
 INFINITY, HUGE = float("inf"), 10**400

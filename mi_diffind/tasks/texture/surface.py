@@ -20,7 +20,7 @@ from ...arrays.boxes import ValueBounds
 from ...core.compat import backend_module
 from ...core.errors import UsageError
 from ...images import srgb
-from ...maps.layout import Layout, MapLayout, common_transform
+from ...maps.layout import Layout, MapLayout, different_transforms
 from ...maps.pyramid import FilteredMaps
 from ..disney import TASK as DISNEY
 from ..disney.decoder import Decoder, Lobe
@@ -65,10 +65,8 @@ def maps_of(layout: Layout) -> dict[str, MapLayout]:
         by_role[m.role] = m
     if not by_role:
         raise UsageError(f"source: found no map that shading reads, these are {', '.join(READ)}")
-    try:
-        common_transform(by_role.values())
-    except ValueError as e:
-        raise UsageError(f"source: {e}") from None
+    if fault := different_transforms(by_role.values()):
+        raise UsageError(f"source: {fault}")
     return by_role
 
 
