@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_diffind.core import compat
-from mi_diffind.maps.layout import Layout, MapLayout
+from mi_diffind.maps.layout import Layout, MapLayout, different_transforms
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.decoder import Lobe
 from mi_diffind.tasks.disney.model import PARAMETERS, clamp
@@ -87,6 +87,8 @@ def material_maps(layout: Layout, ignored: tuple[str, ...] = ()) -> tuple[dict[s
             maps[parameter] = m
     if not maps:
         raise RuntimeError(f'parameter "filename": no map is left to read, the file holds {", ".join(layout.names)}')
+    if fault := different_transforms(maps.values()):
+        raise RuntimeError(f'parameter "filename": {fault}: read each by a neural_texture')
     return maps, left_out
 
 
@@ -112,7 +114,7 @@ class MaterialMaps(FilteredTexture):
 
     def _choose(self, props):
         self.maps, self.left_out = material_maps(self.image.layout, ignored(props))
-        return next(iter(self.maps.values())), False
+        return next((m for m in self.maps.values() if m.varies), next(iter(self.maps.values()))), False
 
     def _shown(self):
         return list(self.maps.values())
@@ -138,7 +140,7 @@ class MaterialMaps(FilteredTexture):
 
     def is_constant(self, parameter: str) -> bool:
         """Return whether the map of a parameter is one colour or number."""
-        return all(isinstance(where, tuple) for where in self.maps[parameter].where)
+        return not self.maps[parameter].varies
 
     def _title(self):
         return f'the material "{self._owner}" (neural_material, {self._path})'
@@ -186,7 +188,7 @@ class NeuralMaterial(Disney):
 
      * - two_sided
        - |bool|
-       - Reflect on both sides, as a material in :monosp:`twosided` does. (Default: false)
+       - Reflect on both sides, as a material in :monosp:`twosided` does. (Default: that of the file, else false)
        - --
 
      * - base_color, roughness, anisotropic, metallic, specular, eta, spec_tint, sheen, sheen_tint, flatness,
@@ -242,8 +244,8 @@ class NeuralMaterial(Disney):
 
     {footprint}
 
-    Without ``two_sided`` the material reflects on the front side only. Components are those of
-    :ref:`disney <bsdf-disney>`. Sampling is detached, as there.
+    Without ``two_sided``, which the file of a glTF material with ``doubleSided`` contains, the material reflects on the
+    front side only. Components are those of :ref:`disney <bsdf-disney>`. Sampling is detached, as there.
 
     {executable}
 
@@ -255,8 +257,8 @@ class NeuralMaterial(Disney):
         if lobes != "exact":
             self.decoder = DISNEY.open(mi.TensorXf, preset=lobes, storage="uint8").decoder
         self.lobes = lobes
-        self.two_sided = properties.flag(props, "two_sided")
         self.maps = MaterialMaps(props)
+        self.two_sided = properties.flag(props, "two_sided", self.maps.image.layout.double_sided)
         for name in ("base_color", *self.scalars, "subsurface", "specular", "eta"):
             if name in props and isinstance(props[name], mi.Texture) and not compat.is_constant_texture(props[name]):
                 raise RuntimeError(f'parameter "{name}": found a texture, allowed are numbers: maps come from the file')
@@ -415,8 +417,9 @@ class MapPoint(ShadedPoint):
 
 def _convert(props: mi.Properties, bsdf: str, texture: str) -> str:
     """Change properties to those of Mitsuba's plugins, nested, and return the name of the outermost one."""
-    maps, _ = material_maps(file_layout(TASK, props), ignored(props))
-    sides = props.get("two_sided", False)
+    layout = file_layout(TASK, props)
+    maps, _ = material_maps(layout, ignored(props))
+    sides = props.get("two_sided", layout.double_sided)
 
     def shown(name: str) -> mi.Texture:
         image = mi.Properties(texture)
@@ -485,7 +488,7 @@ def _from_stock(node: StockNode) -> str | None:
         inner.allow(parameter)
         (inner,) = nested
     images = {**inner.children, **images}
-    if "bitmap" not in [child.name for child in images.values() if child]:
+    if "bitmap" not in node.nested_types(mi.ObjectType.Texture):
         return None
     check_principled(inner)
     for child in (inner, *filter(None, images.values())):

@@ -256,6 +256,10 @@ def paint(*more):
     return f'<bsdf type="principled">{color}{rough}{"".join(more)}<float name="metallic" value="0.25"/></bsdf>'
 
 
+#: A texture that nests an image.
+CHECKER = f'<texture type="checkerboard" name="sheen">{image("rough", "color0")}</texture>'
+
+
 def bumpy(inner):
     return f'<bsdf type="normalmap">{image("bumps", "normalmap")}{inner}</bsdf>'
 
@@ -315,6 +319,7 @@ def test_a_material_of_nested_plugins(mi_rgb, maps):
         (paint(image("image", "sheen")), 'has the image image.png with colours for "sheen", which is a number'),
         (paint(image("holes", "sheen", scale=3)), 'has images that differ in "to_uv"'),
         (paint('<texture type="checkerboard" name="sheen"/>'), 'has the texture "checkerboard" for "sheen"'),
+        (f'<bsdf type="principled">{CHECKER}</bsdf>', 'has the texture "checkerboard" for "sheen", allowed are'),
         (paint('<spectrum name="sheen" value="400:0.1, 700:0.2"/>'), 'has a spectrum for "sheen"'),
         (paint('<float name="spec_trans" value="0.5"/>'), "transmits light (spec_trans)"),
         (f'<bsdf type="mask"><float name="opacity" value="0.5"/>{paint()}</bsdf>', 'has a number for "opacity"'),

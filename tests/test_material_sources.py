@@ -15,12 +15,15 @@ import pytest
 from PIL import Image
 
 import mi_diffind
+from mi_diffind.core.errors import UsageError
 from mi_diffind.core.files import PATHS
 from mi_diffind.fitting.task import tasks
-from mi_diffind.maps.entries import split_material
+from mi_diffind.maps.entries import IDENTITY, split_material
+from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.model import origin_lines, size_figures
 from mi_diffind.maps.source import SourceError, from_arrays, load_source
 from mi_diffind.plugins.support.image_files import to_bitmap, to_mipmap
+from mi_diffind.tasks.texture.surface import maps_of
 
 SIZE = 8
 
@@ -244,7 +247,7 @@ def gltf_without_some_maps(folder):
 @case
 def gltf_blend(folder):
     path = gltf(write(three(folder), color__png=RGBA), alphaMode="BLEND", doubleSided=True)
-    return path, {**PAINT, "opacity": unit(RGBA[..., 3:])}, ["m.gltf: keys that are not used: doubleSided"]
+    return path, {**PAINT, "opacity": unit(RGBA[..., 3:])}, []
 
 
 @case
@@ -299,10 +302,10 @@ def gltf_one_of_several(folder):
 
 @case
 def gltf_with_extensions(folder):
-    texture = {"index": 1, "extensions": {"KHR_texture_transform": {"scale": [2, 2]}}, "texCoord": 1}
+    texture = {"index": 1, "extensions": {"KHR_texture_webp": {}}, "texCoord": 1}
     glass = {"KHR_materials_transmission": {"transmissionFactor": 1}}
     path = gltf(three(folder), normalTexture=texture, extensions=glass, emissiveFactor=[1, 1, 1])
-    notes = ["normalTexture: KHR_texture_transform is not used", "normalTexture: its texture coordinates, set 1, are"]
+    notes = ["normalTexture: KHR_texture_webp is not used", "normalTexture: its texture coordinates, set 1, are"]
     return path, PAINT, [*notes, "keys that are not used: emissiveFactor", "KHR_materials_transmission is not used"]
 
 
@@ -353,6 +356,7 @@ def test_a_source_is_read(tmp_path, name):
     lines = origin_lines(loaded)
     assert len(lines) == 1 + len(maps) and re.split(r"  +", lines[0])[:3] == ["map", "file", "channels"]
     assert load_source(str(source), outside=True).digest == loaded.digest and loaded.file_nbytes > 0
+    assert loaded.double_sided == (name == "gltf_blend") and {m.transform for m in loaded.maps} == {IDENTITY}
 
 
 def test_the_table_says_what_was_changed(tmp_path):
@@ -362,6 +366,37 @@ def test_the_table_says_what_was_changed(tmp_path):
     assert row == {"map": "roughness", **expected, "change": "inverted (1 − x)"}
     write(tmp_path, Maple_NM__png=NORMAL).joinpath("Maple_NM.png").rename(tmp_path / "Maple_NormalDX.png")
     assert [row["change"] for row in load_source(tmp_path).origins][1] == "y inverted"
+
+
+#: A texture transform of glTF, and a step along u.
+CHANGE, HALF = {"scale": [2, 0.5], "rotation": 0.5, "offset": [0.25, -0.1]}, np.array([0.5, 0])
+
+
+def transformed(transform, uv):
+    return np.reshape(transform, (2, 3)) @ [*uv, 1]
+
+
+def test_texture_transforms_of_gltf(tmp_path):
+    """Against the matrices that the extension's text multiplies; maps that differ are no material for one read."""
+    moved, extension = {"offset": [*HALF], "texCoord": 1}, "KHR_texture_transform"
+    base, other = ({"index": i, "extensions": {extension: change}} for i, change in ((0, CHANGE), (2, moved)))
+    textures = {"baseColorTexture": base, "metallicRoughnessTexture": other}
+    path = gltf(write(three(tmp_path), color__png=RGBA), pbrMetallicRoughness=textures, alphaMode="BLEND")
+    source, uv = load_source(path), np.random.default_rng(2).random(2)
+    c, s = np.cos(CHANGE["rotation"]), np.sin(CHANGE["rotation"])
+    columns = [[[1, 0, 0], [0, 1, 0], [*CHANGE["offset"], 1]], [[c, -s, 0], [s, c, 0], [0, 0, 1]]]
+    translation, rotation = (np.transpose(matrix) for matrix in columns)
+    there = (translation @ rotation @ np.diag([*CHANGE["scale"], 1]) @ [*uv, 1])[:2]
+    expected = {"albedo": there, "opacity": there, "roughness": uv + HALF, "metallic": uv + HALF, "normal": uv}
+    for m in source.maps:
+        np.testing.assert_allclose(transformed(m.transform, uv), expected.pop(m.name), rtol=1e-6)
+    assert not expected and [*source.notes] == [
+        "metallicRoughnessTexture: its texture coordinates, set 1, are not used"
+    ]  # fmt: skip
+    changes = {row["map"]: row["change"] for row in source.origins}
+    assert changes["roughness"] == "uv transform [1 0 0.5, 0 1 0]" and changes["normal"] == ""
+    with pytest.raises(UsageError, match=r'the maps "albedo" \(.*\) and "normal" \(none\) differ in their'):
+        maps_of(Layout.from_source(source))
 
 
 REFUSALS = {}
@@ -558,7 +593,11 @@ def test_names_of_materials(source, expected):
 def test_a_material_of_a_gltf_file_is_fitted(mi_rgb, tmp_path, monkeypatch, capsys, task):
     """The table is printed once; the result measures itself by the material that it records."""
     monkeypatch.chdir(tmp_path)
-    path = gltf(three(tmp_path), count=2)
+    turned = {"KHR_texture_transform": {"offset": [0.25, 0.5]}}
+    textures = {name: {**texture, "extensions": turned} for name, texture in pbr().items()}
+    normal = {"index": 1, "extensions": turned}
+    more = {"pbrMetallicRoughness": textures, "normalTexture": normal, "doubleSided": True}
+    path = gltf(write(three(tmp_path), color__png=DEEP), count=2, **more)
     options = {"steps": 2, "batch": 256, "compression": 2, **({"shading": "off"} if task == "texture" else {})}
     fitted = mi_diffind.fit(task, f"{path.name}#paint1", **options)
     printed = capsys.readouterr().out
@@ -569,16 +608,22 @@ def test_a_material_of_a_gltf_file_is_fitted(mi_rgb, tmp_path, monkeypatch, caps
     assert [row["map"] for row in fitted.report["origins"]] == list(PAINT)
     model = mi_diffind.open(fitted.save(tmp_path / "a.npz"))
     assert model.table.settings["source_path"] == "m.gltf#paint1" and model.measure()["psnr_db"] > 0
+    described, lines = model.describe()
+    assert described["double_sided"] and described["maps"]["albedo"]["transform"] == [1, 0, 0.25, 0, 1, 0.5]
+    assert "uv transform [1 0 0.25, 0 1 0.5]" in lines[2] and "  the material is double-sided" in lines
     # The exact counterparts read the same material
-    props = mi_rgb.Properties(f"neural_{task}")
-    props["filename"], props["channels"] = str(tmp_path / "a.npz"), "roughness"
-    to_bitmap(tasks()[task], props)
-    np.testing.assert_array_equal(np.array(props["bitmap"]).squeeze(), ORM[..., 1])
+    for name, values in (("albedo", unit(DEEP)[..., 0]), ("roughness", ORM[..., 1])):
+        props = mi_rgb.Properties(f"neural_{task}")
+        props["filename"], props["channels"] = str(tmp_path / "a.npz"), name
+        to_bitmap(tasks()[task], props)
+        np.testing.assert_allclose(np.array(props["bitmap"]), values, rtol=1e-6)
     to_mipmap(tasks()[task], props)
     texture = {"type": "mipmap", "channels": "roughness", "filename": props["filename"], "filter": "off"}
     si = mi_rgb.SurfaceInteraction3f()
-    si.uv = mi_rgb.Point2f(2.5 / SIZE, 1 - 4.5 / SIZE)
-    assert mi_rgb.load_dict(texture).eval_1(si)[0] in np.float32(unit(ORM[..., 1]))
+    si.uv = mi_rgb.Point2f(2.5 / SIZE, 3.5 / SIZE)
+    bitmap = {"type": "bitmap", **{name: props[name] for name in ("bitmap", "raw", "to_uv")}}
+    for one in (texture, bitmap):  # the texel two to the right and four below
+        assert mi_rgb.load_dict(one).eval_1(si)[0] == pytest.approx(unit(ORM[7, 4, 1]), abs=1e-6)
 
 
 def test_small_source_files_are_said(tmp_path):
@@ -651,6 +696,38 @@ def test_materialx(tmp_path):
     path.write_text(MTLX.replace("image", "noise2d").replace("surface_color", "x"))
     with pytest.raises(SourceError, match="has no images that are read"):
         load_source(path)
+
+
+@pytest.mark.parametrize("order", [0, 1])
+def test_texture_transforms_of_materialx(tmp_path, order):
+    """``tiledimage``, ``place2d`` in both orders, and both after each other, point by point as their graphs say."""
+    pytest.importorskip("MaterialX", reason="the optional package MaterialX is not installed")
+    (tmp_path / "maps").mkdir()
+    three(tmp_path / "maps")
+    numbers = {"pivot": "0.5, 0.25", "scale": "0.5, 2", "rotate": 30, "offset": "0.1, 0.3", "operationorder": order}
+    ports = "".join(f'<input name="{name}" value="{value}"/>' for name, value in numbers.items())
+    place = '<input name="texcoord" type="vector2" nodename="place" />'
+    tiles = ("uvtiling", "3, 2"), ("uvoffset", "0.5, 0")
+    tiles = "".join(f'<input name="{name}" type="vector2" value="{value}" />' for name, value in tiles)
+    text = MTLX.replace("  <nodegraph", f'  <place2d name="place" type="vector2">{ports}</place2d>\n  <nodegraph', 1)
+    text = text.replace('colorspace="srgb_texture" />', f'colorspace="srgb_texture" />{place}')
+    text = re.sub(r'<image (name="orm".*?)</image>', rf"<tiledimage \1{tiles}{place}</tiledimage>", text)
+    text = text.replace('value="normal.png" /></image>', f'value="normal.png" />{tiles}</image>')
+    (tmp_path / "m.mtlx").write_text(text)
+    source, uv = load_source(tmp_path / "m.mtlx"), np.random.default_rng(3).random(2)
+    x, y = uv[0] - 0.5, (1 - uv[1]) - 0.25  # v points up, from the pivot
+    x, y = (x - 0.1, y - 0.3) if order else (x / 0.5, y / 2)
+    turned = (x + 1j * y) * np.exp(-1j * np.pi / 6)
+    x, y = (turned.real / 0.5, turned.imag / 2) if order else (turned.real - 0.1, turned.imag - 0.3)
+    placed = np.array([x + 0.5, y + 0.25])
+    expected = {"albedo": placed, "roughness": placed * [3, 2] - HALF}
+    transforms = {m.name: m.transform for m in source.maps}
+    for name, place in expected.items():
+        np.testing.assert_allclose(transformed(transforms[name], uv) * [1, -1] + [0, 1], place, rtol=1e-6)
+    assert transforms["normal"] == transforms["metallic"] == IDENTITY and [*source.notes] == [
+        "normal: image: inputs that are not used: uvtiling, uvoffset",
+        "m.mtlx: inputs that are not used: coat",
+    ]
 
 
 def test_materialx_may_be_missing(tmp_path):

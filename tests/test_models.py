@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from mi_diffind.commands.cli import main
-from mi_diffind.core.files import CACHE
+from mi_diffind.core.files import CACHE, OutputError
 from mi_diffind.maps.entries import SourceError
 from mi_diffind.maps.source import load_source
 from mi_diffind.scenes import conversion, loading
@@ -65,18 +65,30 @@ def write(path, content, data):
     return path
 
 
-@pytest.mark.parametrize("extension", ["glb", "gltf"])
-def test_a_card_is_seen_the_right_way_up(mi_rgb, tmp_path, monkeypatch, extension):
+#: A quarter turn of the texture coordinates, counterclockwise; the image turns clockwise.
+QUARTER = {"rotation": np.pi / 2, "offset": [0, 1]}
+
+
+def place(content, change):
+    """Give the texture of a card a transform."""
+    texture = content["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+    texture["extensions"] = {"KHR_texture_transform": change}
+
+
+@pytest.mark.parametrize("extension, change", [("glb", {}), ("gltf", QUARTER)])
+def test_a_card_is_seen_the_right_way_up(mi_rgb, tmp_path, monkeypatch, extension, change):
     """Quarters of its image where a viewer in front sees them, from a camera that frames it."""
     monkeypatch.setenv(CACHE, str(tmp_path / "cache"))
-    path = write(tmp_path / f"card.{extension}", *card(doubleSided=True))
+    content, data = card(doubleSided=True)
+    place(content, change)
+    path, colors = write(tmp_path / f"card.{extension}", content, data), np.rot90(COLORS, -1 if change else 0)
     scene = loading.load(path, {"width": 32, "height": 32, "spp": 16})
     picture = loading.render(scene)[0][..., :3]
     (shape,) = [s for s in scene.shapes() if "PLY" in s.class_name()]
     assert np.allclose(shape.bbox().min, [8, 18, 30]) and np.allclose(shape.bbox().max, [12, 22, 30])
     for row, column in np.ndindex(2, 2):
         seen = picture[12 + 8 * row, 12 + 8 * column]
-        assert (seen > 0.6 * seen.max()).tolist() == (COLORS[row, column] > 100).tolist()
+        assert (seen > 0.6 * seen.max()).tolist() == (colors[row, column] > 100).tolist()
     before = sorted((tmp_path / "cache").rglob("*"))
     assert main(["render", str(path), "-o", str(tmp_path / "a.exr"), "-D", "width=16", "-D", "spp=1"]) == 0
     assert sorted((tmp_path / "cache").rglob("*")) == before and len(before) == 4
@@ -107,14 +119,22 @@ def test_a_model_is_converted(mi_rgb, tmp_path, monkeypatch):
     monkeypatch.setenv(CACHE, str(tmp_path / "cache"))
     fit = conversion.fit
     monkeypatch.setattr(conversion, "fit", lambda task, **given: fit(task, **{**given, "steps": 40, "batch": 2**12}))
-    path, new = write(tmp_path / "card.glb", *card()), tmp_path / "new.xml"
+    content, data = card(doubleSided=True)
+    place(content, QUARTER)
+    path, new = write(tmp_path / "card.glb", content, data), tmp_path / "new.xml"
     (one,) = result = conversion.convert(path, new, defines={"width": 16, "height": 16}, progress=False)
-    assert (one.stock, one.learned, one.name) == ("principled", "neural_material", "Card_ä")
+    assert (one.stock, one.learned, one.name) == ("twosided", "neural_material", "Card_ä")
+    text = new.read_text()
+    assert "twosided" not in text and 'name="two_sided" value="true"' in text and 'name="to_uv"' in text
     assert result.disk_bytes[0] > 0 and result.check is not None and not (tmp_path / "cache").exists()
     names = {file.name for file in (tmp_path / "new_model").iterdir()}
     assert names == {"scene.xml", "Card_0.ply", "Card_ä_albedo.png"}
     assert len(list(tmp_path.glob("new_tables/*.npz"))) == 1
     assert loading.load(new).shapes()
+    content["meshes"][0]["name"] = "Other"
+    with pytest.raises(OutputError, match=r"new_model: holds Card_0\.ply, which is not of other\.glb: remove"):
+        conversion.convert(write(tmp_path / "other.glb", content, data), new, progress=False)
+    assert {file.name for file in (tmp_path / "new_model").iterdir()} == names and new.read_text() == text
 
 
 def test_names_that_are_missing_long_or_taken(mi_rgb, tmp_path):

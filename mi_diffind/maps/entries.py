@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import tempfile
 from dataclasses import dataclass
@@ -17,6 +18,9 @@ from ..images.reader import Picture, PictureError, read_picture
 ROLES = ("albedo", "normal", "roughness", "ao", "metallic", "other")
 
 COLOR_SPACES = ("srgb", "linear")
+
+#: Texture transform that changes nothing: the first two rows of its matrix.
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
 #: Extensions of files that hold several materials, of which ``FILE#NAME`` names one.
 SEVERAL = (".gltf", ".glb", ".mtlx")
@@ -64,6 +68,7 @@ class MapEntry:
     - ``factor``: factors of the channels, one or as many as there are, of colours in linear light; of a normal map the
       factor of x and y. No factors: ().
     - ``cutoff``: values below become 0, all others 1.
+    - ``transform``: texture transform (:func:`to_transform`), from the surface's uv to those of the image.
     """
 
     name: str
@@ -76,6 +81,7 @@ class MapEntry:
     cutoff: float | None = None
     opaque: bool = False
     single: bool = False
+    transform: tuple[float, ...] = IDENTITY
 
     constant: bool = False
 
@@ -126,6 +132,26 @@ class ImageFiles:
                     raise SourceError(str(e).replace(str(path), name)) from None
             self.nbytes += len(data)
         return name
+
+
+def uv_matrix(scale=(1.0, 1.0), rotation: float = 0.0, offset=(0.0, 0.0)) -> np.ndarray:
+    """Return the matrix of glTF's KHR_texture_transform, ``(3, 3)``; ``rotation`` is in radians.
+
+    Texture coordinates are scaled, turned from the axis v towards u, and moved by ``offset``.
+    """
+    c, s = math.cos(rotation), math.sin(rotation)
+    return np.array([[c * scale[0], s * scale[1], offset[0]], [-s * scale[0], c * scale[1], offset[1]], [0, 0, 1]])
+
+
+def to_transform(matrix: np.ndarray) -> tuple[float, ...]:
+    """Return a texture transform: the first two rows of a matrix, ``(3, 3)``, for v that points down."""
+    return tuple(round(float(number), 12) + 0.0 for number in matrix[:2].ravel())
+
+
+def describe_transform(transform: tuple[float, ...]) -> str:
+    """Return a texture transform as text, "" for none."""
+    rows = (" ".join(f"{number:.4g}" for number in transform[i : i + 3]) for i in (0, 3))
+    return "" if transform == IDENTITY else f"uv transform [{', '.join(rows)}]"
 
 
 def split_material(source: str | os.PathLike) -> tuple[Path, str]:

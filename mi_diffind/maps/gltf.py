@@ -8,6 +8,7 @@ import json
 import os
 import struct
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import unquote_to_bytes
 
@@ -16,7 +17,10 @@ from ..core.errors import reason
 from ..core.files import RecordedKeys, shown, unused_note
 from ..core.units import memory
 from ..images.reader import PictureError, read_file
-from .entries import ImageFiles, MapEntry, SourceError, choose_material, transparent
+from .entries import ImageFiles, MapEntry, SourceError, choose_material, to_transform, transparent, uv_matrix
+
+#: Extension that transforms texture coordinates.
+TRANSFORM = "KHR_texture_transform"
 
 #: Types of images that are read.
 READ = ("image/png", "image/jpeg", "")
@@ -33,16 +37,17 @@ TEXTURES = {
 }
 
 
-def read_gltf(path: Path, name: str, images: ImageFiles) -> tuple[list[MapEntry], list[str]]:
-    """Return the maps of the material called ``name``, or of the only one, and notes on what is not used.
+def read_gltf(path: Path, name: str, images: ImageFiles) -> tuple[list[MapEntry], list[str], bool]:
+    """Return the maps of the material called ``name``, or of the only one, notes on what is not used, and its sides.
 
-    Factors multiply the images; the one of a missing image is a constant map. With ``alphaMode`` BLEND or MASK there is
-    a map of opacity. Raises :class:`SourceError`.
+    It has two sides if it is ``doubleSided``. Factors multiply the images; the one of a missing image is a constant
+    map. With ``alphaMode`` BLEND or MASK there is a map of opacity. Raises :class:`SourceError`.
     """
     try:
         content, binary = read_content(path)
         material = content.get("materials", [])[choose_material(path, material_names(content), name)]
-        return _Reader(path, content, binary, images).entries(material)
+        double_sided = material.get("doubleSided") is True
+        return *_Reader(path, content, binary, images).entries(material), double_sided
     except (SourceError, LimitError, PictureError) as e:
         raise SourceError(str(e)) from None
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, struct.error) as e:
@@ -86,10 +91,11 @@ class _Reader:
     def entries(self, material: dict) -> tuple[list[MapEntry], list[str]]:
         """Return the maps of a material, and notes."""
         pbr = material.get("pbrMetallicRoughness", RecordedKeys())
-        files, left_out = {}, set()
+        files, transforms, left_out = {}, {}, set()
         for texture, maps in TEXTURES.items():
             info = material.get(texture) or pbr.get(texture)
             if info is not None:
+                transforms |= dict.fromkeys(maps, self._transform(texture, info))
                 file = self._image(texture, info)
                 files |= dict.fromkeys(maps, file) if file else {}
                 left_out |= set() if file else set(maps)
@@ -106,10 +112,11 @@ class _Reader:
                 if name in files:
                     space, factor = "srgb" if name == "albedo" else "linear", () if set(factor) == {1.0} else factor
                     entry = MapEntry(name, files[name], None, channels, space, factor=factor, opaque=True)
-                    entries.append(entry)
+                    entries.append(replace(entry, transform=transforms[name]))
                 elif name not in left_out and name not in ("normal", "ao"):
                     entries.append(MapEntry(name, color_space="linear", factor=factor, constant=True))
-        entries += self._opacity(material, files.get("albedo"), alpha)
+        for entry in self._opacity(material, files.get("albedo"), alpha):
+            entries.append(entry if entry.constant else replace(entry, transform=transforms["albedo"]))
         strength = (material.get("occlusionTexture") or {}).get("strength", 1)
         self.notes += [f"occlusionTexture: its strength {strength:g} is not used"] if strength != 1 else []
         self.notes += [f"{name} is not used" for name in material.pop("extensions", {})]
@@ -131,11 +138,18 @@ class _Reader:
         alpha = alpha if cutoff is None else float(alpha >= cutoff)
         return [MapEntry("opacity", color_space="linear", factor=(alpha,), constant=True)] if alpha < 1 else []
 
+    def _transform(self, texture: str, info: dict) -> tuple[float, ...]:
+        """Return the texture transform of a texture, and add notes on its extensions and its texture coordinates."""
+        extensions = info.pop("extensions", {})
+        change = extensions.get(TRANSFORM, {})
+        self.notes += [f"{texture}: {name} is not used" for name in extensions if name != TRANSFORM]
+        if uv_set := change.get("texCoord", info.get("texCoord", 0)):
+            self.notes.append(f"{texture}: its texture coordinates, set {uv_set}, are not used")
+        scale, offset = change.get("scale", (1, 1)), change.get("offset", (0, 0))
+        return to_transform(uv_matrix(scale, change.get("rotation", 0), offset))
+
     def _image(self, texture: str, info: dict) -> str:
         """Return the path or name of the image of a texture, "" if its format is not read."""
-        self.notes += [f"{texture}: {name} is not used" for name in info.pop("extensions", {})]
-        if info.get("texCoord", 0):
-            self.notes.append(f"{texture}: its texture coordinates, set {info['texCoord']}, are not used")
         source = self.content["textures"][info["index"]]
         sampler = self.content["samplers"][source["sampler"]] if "sampler" in source else {}
         if {sampler.get(f"wrap{axis}", REPEAT) for axis in "ST"} != {REPEAT}:

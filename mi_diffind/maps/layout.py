@@ -7,6 +7,7 @@ stored channels, each scaled to [0, 1], and the origin of each channel of each m
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -14,8 +15,8 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from ..arrays.pages import page_gain
-from .entries import ROLES
-from .source import Map, Source
+from .entries import IDENTITY, ROLES, describe_transform
+from .source import MOST_FACTOR, Map, Source
 
 #: Least PSNR, in dB, of the third component of a normal that is derived from the other two.
 NORMAL_FLOOR_DB = 45.0
@@ -54,6 +55,12 @@ class MapLayout:
     low: float = 0.0
     high: float = 1.0
     knee: float = 0.0
+    transform: tuple[float, ...] = IDENTITY
+
+    @property
+    def varies(self) -> bool:
+        """Whether the map is not one colour or number."""
+        return not all(isinstance(w, tuple) for w in self.where)
 
     @property
     def channels(self) -> int:
@@ -62,8 +69,9 @@ class MapLayout:
 
     def to_json(self) -> dict:
         """Return the entry of a table file's settings."""
-        where = [list(w) if isinstance(w, tuple) else w for w in self.where]
-        return {("kind" if k == "role" else k): v for k, v in {**asdict(self), "where": where}.items()}
+        entry = {("kind" if k == "role" else k): v for k, v in asdict(self).items() if v != IDENTITY}
+        entry["where"] = [list(w) if isinstance(w, tuple) else w for w in self.where]
+        return entry
 
     def encode(self, values):
         """Return the stored numbers in [0, 1] of ``values``; values beyond the range of the map become its ends."""
@@ -84,7 +92,8 @@ class MapLayout:
 class Layout:
     """Size, maps and stored channels of a material.
 
-    ``initial`` has the paper's initial value of each stored channel, ``groups`` the name of its map.
+    ``initial`` has the paper's initial value of each stored channel, ``groups`` the name of its map. ``double_sided``:
+    the material reflects on both sides.
     """
 
     width: int
@@ -92,6 +101,7 @@ class Layout:
     maps: tuple[MapLayout, ...]
     initial: tuple[float, ...]
     groups: tuple[str, ...]
+    double_sided: bool = False
 
     @staticmethod
     def from_source(
@@ -132,7 +142,7 @@ class Layout:
                     groups.append(m.name)
                 where.append(same[0])
             maps.append(replace(shell, where=tuple(where)))
-        return Layout(source.width, source.height, tuple(maps), tuple(initial), tuple(groups))
+        return Layout(source.width, source.height, tuple(maps), tuple(initial), tuple(groups), source.double_sided)
 
     @property
     def stored(self) -> int:
@@ -203,6 +213,7 @@ class Layout:
             "maps": [m.to_json() for m in self.maps],
             "initial": list(self.initial),
             "groups": list(self.groups),
+            **({"double_sided": True} if self.double_sided else {}),
         }
 
     @staticmethod
@@ -226,14 +237,26 @@ class Layout:
             finite = max(-low, high, knee) <= LARGEST
             if not (finite and low < high and knee >= 0) or (knee > 0 and not 0 < high <= 1e6 * knee):
                 raise ValueError(f'the map "{entry["name"]}" has no range of values')
-            maps.append(MapLayout(str(entry["name"]), role, color_space, depth, where, low, high, knee))
+            transform = tuple(map(float, entry.get("transform", IDENTITY)))
+            if len(transform) != 6 or not all(abs(number) <= MOST_FACTOR for number in transform):  # NaN, too
+                raise ValueError(f'the map "{entry["name"]}" has no texture transform')
+            maps.append(MapLayout(str(entry["name"]), role, color_space, depth, where, low, high, knee, transform))
         width, height = int(settings["width"]), int(settings["height"])
         initial, groups = tuple(map(float, settings["initial"])), tuple(map(str, settings["groups"]))
         if min(width, height) < 1 or width * height >= 2**32 or not maps or len(initial) != len(groups):
             raise ValueError("the size or the channels of the image are damaged")
         if len({m.name for m in maps}) != len(maps):
             raise ValueError("two maps have the same name")
-        return Layout(width, height, tuple(maps), initial, groups)
+        return Layout(width, height, tuple(maps), initial, groups, settings.get("double_sided", False) is True)
+
+
+def different_transforms(maps: Iterable[MapLayout]) -> str:
+    """Return a clause that names two of the maps which vary and have different texture transforms, "" without such."""
+    for first, m in itertools.pairwise(m for m in maps if m.varies):
+        if m.transform != first.transform:
+            pair = " and ".join(f'"{x.name}" ({describe_transform(x.transform) or "none"})' for x in (first, m))
+            return f"the maps {pair} differ in their texture transforms"
+    return ""
 
 
 def _where(w, stored: int):
@@ -262,7 +285,7 @@ def _range(m: Map) -> MapLayout:
         knee, high = max(middle, 1e-3 * largest), largest
     elif smallest < 0 or (m.depth > 1 and m.color_space == "linear" and 0 < largest - smallest < NARROW):
         low, high = smallest, max(largest, smallest + 1e-6 * max(1.0, abs(smallest)))
-    return MapLayout(m.name, m.role, m.color_space, m.depth, (), low, high, knee)
+    return MapLayout(m.name, m.role, m.color_space, m.depth, (), low, high, knee, m.transform)
 
 
 def _drops_z(m: Map, where: list, wanted: bool | None) -> bool:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ..core.errors import reason
 from ..core.files import irregular, shown
-from .entries import ImageFiles, MapEntry, SourceError, choose_material
+from .entries import IDENTITY, ImageFiles, MapEntry, SourceError, choose_material, to_transform, uv_matrix
 
 #: Bytes and nested elements of the largest document, and nodes between an input and its image.
 MOST_BYTES = 2**22
@@ -47,10 +50,10 @@ CHANNELS = dict(zip("xyzwrgba", "rgbargba", strict=True))
 SPACES = {"srgb_texture": "srgb", "lin_rec709": "linear", "lin_srgb": "linear", "raw": "linear", "": "linear"}
 
 
-def read_materialx(path: Path, name: str, images: ImageFiles) -> tuple[list[MapEntry], list[str]]:
-    """Return the maps of the material called ``name``, or of the only one, and notes on what is not used.
+def read_materialx(path: Path, name: str, images: ImageFiles) -> tuple[list[MapEntry], list[str], bool]:
+    """Return the maps of the material called ``name``, or of the only one, notes, and no second side.
 
-    Raises :class:`SourceError`, also without the package MaterialX.
+    Notes say what is not used. Raises :class:`SourceError`, also without the package MaterialX.
     """
     try:
         import MaterialX as mx
@@ -63,7 +66,7 @@ def read_materialx(path: Path, name: str, images: ImageFiles) -> tuple[list[MapE
         mx.readFromXmlFile(document, str(path), mx.FileSearchPath(), options)
         pairs = [(m.getName(), node) for m in document.getMaterialNodes() for node in mx.getShaderNodes(m)]
         shader = pairs[choose_material(path, [name for name, _ in pairs], name)][1]
-        return _entries(path, shader, images)
+        return *_entries(path, shader, images), False
     except SourceError:
         raise
     except Exception as e:  # classes of the package
@@ -149,7 +152,11 @@ def _trace(path: Path, name: str, port, images: ImageFiles) -> tuple[MapEntry | 
     known = {"gltf_normalmap": "scale"}.get(category, "factor")
     if (factor := node.getInput(known)) is not None:
         changes = _times(changes, _numbers(factor))
-    unused = [p.getName() for p in node.getInputs() if p.getName() not in ("file", known)]
+    try:
+        transform, read = _transform(node)
+    except (IndexError, ValueError):
+        transform, read = IDENTITY, []
+    unused = [p.getName() for p in node.getInputs() if p.getName() not in ("file", known, *read)]
     note = f"{category}: inputs that are not used: {', '.join(unused)}" if unused else ""
     single = name in ("roughness", "metallic", "ao", "opacity")
     if channel and not single:
@@ -158,8 +165,40 @@ def _trace(path: Path, name: str, port, images: ImageFiles) -> tuple[MapEntry | 
         channel = channel or "r"
     return replace(
         changes, file=images.find(path.parent, file.getResolvedValueString(), path), channels=channel,
-        color_space=space if name == "albedo" else "linear", single=single,
+        color_space=space if name == "albedo" else "linear", single=single, transform=transform,
     ), note  # fmt: skip
+
+
+def _transform(image) -> tuple[tuple[float, ...], list[str]]:
+    """Return the texture transform of a node that reads an image, and the names of the inputs that it follows from.
+
+    Raises ``IndexError`` and ``ValueError`` for inputs without a value.
+    """
+
+    def values(node, name: str, *default: float) -> np.ndarray:
+        port = node.getInput(name)
+        return np.array(default if port is None else _numbers(port.getInterfaceInput() or port))
+
+    def before(node):
+        port = node.getInput("texcoord")
+        return port.getConnectedNode() if port is not None else None
+
+    matrix, read, node = np.eye(3), [], before(image)
+    if image.getCategory() == "tiledimage":
+        matrix = uv_matrix(values(image, "uvtiling", 1, 1), offset=-values(image, "uvoffset", 0, 0))
+        read = ["uvtiling", "uvoffset"]
+    if node is not None and node.getCategory() == "place2d":
+        pivot, rotation = values(node, "pivot", 0, 0), math.radians(values(node, "rotate", 0)[0])
+        with np.errstate(all="ignore"):  # infinite numbers are refused with the others
+            steps = [uv_matrix(offset=-values(node, "offset", 0, 0)), uv_matrix(rotation=rotation)]
+            steps.append(uv_matrix(1 / values(node, "scale", 1, 1)))
+            first, second, third = steps[::-1] if values(node, "operationorder", 0)[0] else steps
+            matrix = matrix @ uv_matrix(offset=pivot) @ first @ second @ third @ uv_matrix(offset=-pivot)
+        node = before(node)
+    if node is None or (node.getCategory() == "texcoord" and not values(node, "index", 0)[0]):
+        read.append("texcoord")
+    flip = uv_matrix((1, -1), offset=(0, 1))  # v points up in MaterialX
+    return to_transform(flip @ matrix @ flip), read
 
 
 def _times(entry: MapEntry, values: tuple[float, ...]) -> MapEntry:

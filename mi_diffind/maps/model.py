@@ -21,6 +21,7 @@ from ..fitting.loop import FitResult, Problem
 from ..fitting.task import FitRequest, Fitted, Model
 from ..images import srgb
 from . import as_seen
+from .entries import describe_transform
 from .layout import Layout
 from .pyramid import CompressedMaps, map_figure
 from .source import Source, load_source
@@ -273,11 +274,14 @@ class MapsModel(Model):
             psnr = table.measured.get(map_figure(m.name))
             stored = [w if isinstance(w, int) else "from x and y" if w == "z" else f"is {w[1]:.4g}" for w in m.where]
             content = {"role": m.role, "channels": m.channels, "color_space": m.color_space}
+            content["transform"] = list(m.transform)
             maps[m.name] = {**content, "stored_as": stored, "psnr_db": psnr}
             error = f", {psnr:.2f} dB" if psnr is not None else ""
-            kept = ", ".join(map(str, stored))
+            kept = ", ".join(filter(None, (*map(str, stored), describe_transform(m.transform))))
             lines.append(f"  {m.name:20} {m.role}, {m.channels} channel(s), {m.color_space}, stored as {kept}{error}")
+        lines += ["  the material is double-sided"] * layout.double_sided
         figures = {"width": layout.width, "height": layout.height, "source_bytes": layout.source_nbytes}
+        figures["double_sided"] = layout.double_sided
         return {**figures, "memory_bytes": self.memory_nbytes, "compression": ratio, "maps": maps}, lines
 
     def measure(self, source=None) -> dict[str, float]:

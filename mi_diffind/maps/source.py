@@ -37,11 +37,13 @@ from ..images.reader import DEPTHS, ENCODED, MAX_CHANNELS, Picture, PictureError
 from .entries import (
     COLOR_SPACES,
     COLOURS,
+    IDENTITY,
     UNKNOWN,
     Content,
     ImageFiles,
     MapEntry,
     SourceError,
+    describe_transform,
     equal,
     split_material,
     transparent,
@@ -79,7 +81,7 @@ class Map:
       numbers by 65535).
     - ``color_space``: ``"srgb"`` if they carry the sRGB transfer function, else ``"linear"``.
     - ``role``: one of :data:`.entries.ROLES`; ``depth``: bytes of a channel in the source: 1, 2 or 4, 0 for a constant
-      without an image.
+      without an image; ``transform``: its texture transform (:class:`.entries.MapEntry`).
     """
 
     name: str
@@ -88,6 +90,7 @@ class Map:
     role: str
     depth: int
     file: str = ""
+    transform: tuple[float, ...] = IDENTITY
 
     @property
     def channels(self) -> int:
@@ -101,6 +104,7 @@ class Source:
     ``digest`` is a SHA-256 over their names, layout and values; ``cleaned`` counts the NaN and infinite values that
     were replaced. ``notes`` are sentences about what was guessed, changed or not used, for people; ``origins`` say of
     which file and channels each map is made, and how; ``file_nbytes`` are the bytes of these files (0: none).
+    ``double_sided``: the material reflects on both sides.
     """
 
     maps: tuple[Map, ...]
@@ -111,6 +115,7 @@ class Source:
     notes: tuple[str, ...] = ()
     origins: tuple[dict[str, str], ...] = ()
     file_nbytes: int = 0
+    double_sided: bool = False
 
     @property
     def channels(self) -> int:
@@ -165,10 +170,11 @@ def load_source(
         if os.path.isdir(where):
             return _load(where, *read_folder(where, images), images, nonfinite)
         if where.suffix.lower() in readers:
-            entries, notes = readers[where.suffix.lower()](where, name, images)
+            entries, notes, double_sided = readers[where.suffix.lower()](where, name, images)
             if not constant and all(entry.constant for entry in entries):
                 raise SourceError(f"{shown(where)}: its material has no images that are read, there is nothing to fit")
-            return _load(where, entries, notes, images, nonfinite, where.suffix.lower() != ".json")
+            source = _load(where, entries, notes, images, nonfinite, where.suffix.lower() != ".json")
+            return replace(source, double_sided=double_sided)
         image, color_space = images.read(str(where)), None
         values, content = image.values[:, :, : image.colors], COLOURS if image.named else UNKNOWN
         if named and image.named:
@@ -189,8 +195,9 @@ def _load(
     maps = []
     for entry in entries:
         where, content = f'{path}: map "{entry.name}"', entry.content or content_of(entry.name)
-        if not all(abs(factor) <= MOST_FACTOR for factor in entry.factor):  # NaN, too
-            raise SourceError(f"{where} has the factors {entry.factor}, allowed are numbers up to {MOST_FACTOR:,g}")
+        for described, numbers in (("factors", entry.factor), ("texture transform", entry.transform)):
+            if not all(abs(number) <= MOST_FACTOR for number in numbers):  # NaN, too
+                raise SourceError(f"{where} has the {described} {numbers}, allowed are numbers up to {MOST_FACTOR:,g}")
         if entry.constant:
             values = np.array(entry.factor, np.float32).reshape(1, 1, -1)
             maps.append(_RawMap(values, replace(entry, content=content, factor=())))
@@ -260,8 +267,8 @@ def from_arrays(arrays: dict, color_spaces: dict[str, str] | None = None, nonfin
     return _assemble(maps, "arrays", nonfinite)
 
 
-def _read_manifest(path: Path, _: str, images: ImageFiles) -> tuple[list[MapEntry], list[str]]:
-    """Return the maps of a manifest, and notes on its content. Raises :class:`SourceError`."""
+def _read_manifest(path: Path, _: str, images: ImageFiles) -> tuple[list[MapEntry], list[str], bool]:
+    """Return the maps of a manifest, notes on its content, and no second side. Raises :class:`SourceError`."""
     try:
         data = read_file(path, MOST_TEXT)
         Allowance(path).check(json_bytes(data), "a manifest")
@@ -298,7 +305,7 @@ def _read_manifest(path: Path, _: str, images: ImageFiles) -> tuple[list[MapEntr
         file = images.find(path.parent, entry["file"], path)
         entries.append(MapEntry(name, file, None, channels, color_space, inverted, tuple(map(float, factor))))
     note = unused_note(path, content)
-    return entries, [note] if note else []
+    return entries, [note] if note else [], False
 
 
 def _unique(pairs: list) -> dict:
@@ -430,6 +437,9 @@ def _assemble(
             srgb_encoded = m.content.colours and number_type in ENCODED and m.values.shape[2] in (1, 3)
             color_space = "srgb" if srgb_encoded else "linear"
         notes += _notes_on(m)
+        a, b, _, c, d, _ = entry.transform
+        if role == "normal" and not (b == c == 0 < min(a, d)):
+            notes.append(f'map "{entry.name}": its texture transform turns the image, but not the normals')
         flipped = m.content.y_down and entry.name != "image"
         values = _inverted(m.values, [1] if flipped else range(m.values.shape[2]) if entry.inverted else [])
         with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite and is reported below
@@ -450,7 +460,7 @@ def _assemble(
         values = np.ascontiguousarray(values, "<f4")
         values.flags.writeable = False
         depth = 0 if entry.constant else DEPTHS[number_type]
-        maps.append(Map(entry.name, values, color_space, role, depth, entry.file))
+        maps.append(Map(entry.name, values, color_space, role, depth, entry.file, entry.transform))
         layout = [entry.name, color_space, role, depth, *values.shape]
         digest.update(json.dumps(layout).encode() + b"\n")
         digest.update(values)
@@ -516,7 +526,7 @@ def _origin(entry: MapEntry, color_space: str, flipped: bool, first: np.ndarray)
         "channels": ", ".join(map(str, channels)),
         "color_space": color_space,
         "factor": ", ".join(f"{value:.4g}" for value in factor) or "1",
-        "change": ", ".join(filter(None, (*changes, cutoff))),
+        "change": ", ".join(filter(None, (*changes, cutoff, describe_transform(entry.transform)))),
     }
 
 

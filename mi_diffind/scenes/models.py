@@ -18,9 +18,9 @@ import numpy as np
 from .. import plugins
 from ..core import compat
 from ..core.errors import DiffindError, missing_package, reason
-from ..core.files import cache_folder, shown, writable_folder
+from ..core.files import OutputError, cache_folder, shown, writable_folder
 from ..core.units import check_memory
-from ..maps.entries import SourceError
+from ..maps.entries import IDENTITY, SourceError
 from ..maps.gltf import material_names, read_content
 from ..maps.source import Map, load_source
 
@@ -87,7 +87,8 @@ def model_scene(path: str | os.PathLike, folder: str | os.PathLike | None = None
     """Write a model as a scene, with its meshes and images, and return the path of the scene file.
 
     - ``path``: a glTF file. Its materials are those that :func:`.load_source` reads; notes on the rest are warnings.
-    - ``folder``: folder of the scene, which is made (``None``: one of the user's cache, by the content of the file).
+    - ``folder``: folder of the scene, which is made and holds no other files (``None``: one of the user's cache, by the
+      content of the file).
 
     Images have 8 bits a channel. Raises :class:`.SourceError` and :class:`.OutputError`.
     """
@@ -100,7 +101,11 @@ def model_scene(path: str | os.PathLike, folder: str | os.PathLike | None = None
         if folder is None and (target / "scene.xml").is_file():
             return target / "scene.xml"
         with tempfile.TemporaryDirectory(dir=writable_folder(target, create=True), prefix=".unfinished") as temporary:
-            for file in _Writer(path, content, Path(temporary)).write():  # the scene last
+            files = _Writer(path, content, Path(temporary)).write()
+            others = {file.name for file in target.glob("[!.]*")} - {file.name for file in files}
+            if others:
+                raise OutputError(f"{target}: holds {min(others)}, which is not of {path.name}: remove the folder")
+            for file in files:  # the scene last
                 os.replace(file, target / file.name)
     except DiffindError:
         raise
@@ -289,17 +294,14 @@ class _Writer:
             return f'    <bsdf type="principled" id="{own_id}">{color}{numbers}</bsdf>\n'
         source = load_source(f"{self.path}#{name}", constant=True)
         for note in source.notes:
-            note = re.sub(r" doubleSided(,|$)", "", note)  # the scene uses it
-            if not note.endswith(":"):
-                plugins.warn(f"{self.path}#{name}: {note}")
-        content = self.content["materials"][number]
+            plugins.warn(f"{self.path}#{name}: {note}")
         maps = {m.name: m for m in source.maps}
         known = {key: parameter for key, parameter in PARAMETERS.items() if key in maps}
         values = "".join(self._map(maps[key], parameter, own_id) for key, parameter in known.items())
         inner = f'<bsdf type="principled">{values}</bsdf>'
         if "normal" in maps:
             inner = f'<bsdf type="normalmap">{self._map(maps["normal"], "normalmap", own_id)}{inner}</bsdf>'
-        if content.get("doubleSided"):
+        if source.double_sided:
             inner = f'<bsdf type="twosided">{inner}</bsdf>'
         if "opacity" in maps:
             inner = f'<bsdf type="mask">{self._map(maps["opacity"], "opacity", own_id)}{inner}</bsdf>'
@@ -318,7 +320,10 @@ class _Writer:
             mi.Bitmap(values).write(str(self._add(self.images[key])))
         raw = "" if m.color_space == "srgb" else '<boolean name="raw" value="true"/>'
         file = f'<string name="filename" value="{self.images[key]}"/>'
-        return f'<texture type="bitmap" name="{parameter}">{file}{raw}</texture>'
+        a, b, c, d, e, f = m.transform
+        matrix = f"{_listed((a, b, 0, c))}, {_listed((d, e, 0, f))}, 0, 0, 1, 0, 0, 0, 0, 1"
+        place = "" if m.transform == IDENTITY else f'<transform name="to_uv"><matrix value="{matrix}"/></transform>'
+        return f'<texture type="bitmap" name="{parameter}">{file}{raw}{place}</texture>'
 
 
 def _listed(numbers) -> str:

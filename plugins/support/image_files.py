@@ -17,7 +17,7 @@ from mi_diffind.core.compat import backend_module
 from mi_diffind.core.files import OutsideError, is_within, path_within, read_once, relative_path, stamp, write_json
 from mi_diffind.fitting.task import Task
 from mi_diffind.images.reader import PictureError, read_picture
-from mi_diffind.maps.entries import equal, has_maps, split_material
+from mi_diffind.maps.entries import IDENTITY, equal, has_maps, split_material
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.pyramid import CompressedMaps, Pyramid
 from mi_diffind.maps.source import Source, from_arrays, load_source
@@ -26,7 +26,7 @@ from .. import warn
 from . import properties
 from .properties import Kept, StockNode, refused_as
 from .tables import Tables, lock, shared
-from .textures import TYPES
+from .textures import TYPES, after_transform, transformation
 
 STORAGES = ("uint8", "float32")
 
@@ -100,7 +100,7 @@ def open_compressed(task: Task, props: mi.Properties) -> tuple[SharedMaps, str]:
 
     def load() -> SharedMaps:
         model = task.read(path, mi.TensorXf, storage)
-        constant = [m.name for m in model.image.layout.maps if all(isinstance(where, tuple) for where in m.where)]
+        constant = [m.name for m in model.image.layout.maps if not m.varies]
         if storage == "float32" and constant:
             warn(
                 f'parameter "storage": found "float32", but {path} has constants in place of the maps '
@@ -189,9 +189,11 @@ def to_bitmap(task: Task, props: mi.Properties) -> None:
     original, layout = find_original(task, props)
     values = _values(original, layout)
     # Bytes stay bytes; 16 bits become float32, since "bitmap" would reduce them to half precision
-    bitmap = mi.Bitmap(np.rint(values * 255).astype(np.uint8) if layout.depth == 1 else np.ascontiguousarray(values))
+    bitmap = mi.Bitmap(np.rint(values * 255).astype(np.uint8) if layout.depth == 1 else np.array(values, order="C"))
     bitmap.set_srgb_gamma(layout.color_space == "srgb")
     props["bitmap"] = bitmap
+    if layout.transform != IDENTITY:
+        props["to_uv"] = mi.ScalarAffineTransform3f(after_transform(layout.transform, transformation(props)))
     props["raw"] = bool(props.get("raw", is_data(layout)))
 
 

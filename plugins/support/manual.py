@@ -31,7 +31,8 @@ PARTS = {
     "to_uv": """\
         * - to_uv
           - |transform|
-          - Transformation of the texture coordinates, as for :monosp:`bitmap`. (Default: none)
+          - Transformation of the texture coordinates, as for :monosp:`bitmap`, after the texture transform that the
+            file may hold. (Default: none)
           - |exposed|""",
     "filtering": """\
         * - filter

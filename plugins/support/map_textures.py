@@ -112,8 +112,7 @@ class MapTexture(mi.Texture):
             self._sampled()
 
     def _update_transformation(self) -> None:
-        m = self.to_uv.matrix
-        matrix = [[float(m[i, j]) for j in range(3)] for i in range(3)]
+        matrix = textures.after_transform(self.map.transform, self.to_uv)
         identity = matrix == np.eye(3).tolist()
         self._transform = None if identity else self._shared.transform(matrix)
         self._permutes = textures.permutes_corners(matrix)
@@ -257,7 +256,7 @@ class MapTexture(mi.Texture):
         return si.wavelengths, self.eval(si, active) * extent
 
     def is_spatially_varying(self):
-        return any(not isinstance(where, tuple) for m in self._shown() for where in m.where)
+        return any(m.varies for m in self._shown())
 
     def resolution(self):
         return mi.ScalarVector2i(*self._size)

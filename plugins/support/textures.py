@@ -67,6 +67,12 @@ def transformation(props: mi.Properties):
     return mi.ScalarAffineTransform3f(matrix)
 
 
+def after_transform(transform: tuple[float, ...], to_uv) -> list[list[float]]:
+    """Return the rows of the matrix that applies the texture transform of a map, then ``to_uv``."""
+    m, transform = to_uv.matrix, np.array([*transform, 0, 0, 1]).reshape(3, 3)
+    return (np.array([[float(m[i, j]) for j in range(3)] for i in range(3)]) @ transform).tolist()
+
+
 def permutes_corners(matrix: list) -> bool:
     """Return whether an affine map takes the unit square to itself: flips, a transposition, quarter turns."""
     m = np.array(matrix)

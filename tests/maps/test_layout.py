@@ -8,7 +8,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from mi_diffind.maps.layout import NORMAL_FLOOR_DB, Layout, MapLayout
+from mi_diffind.maps.layout import NORMAL_FLOOR_DB, Layout, MapLayout, different_transforms
 from mi_diffind.maps.pyramid import root
 from mi_diffind.maps.source import from_arrays
 
@@ -212,8 +212,19 @@ def test_a_normal_is_of_unit_length_or_flat(ad):
 
 def test_json_round_trip():
     source = from_arrays({"normal": unit_normals(), "height": hdr(1e30)[:9, :8, 0], "ao": np.zeros((9, 8), np.uint8)})
-    for layout in (LAYOUT, Layout.from_source(source)):
+    placed = replace(MAPS[1], transform=(2.0, 0.0, 0.25, 0.5, -1.0, 1.0))
+    changed = replace(LAYOUT, maps=(MAPS[0], placed, *MAPS[2:]), double_sided=True)
+    for layout in (LAYOUT, Layout.from_source(source), changed):
         assert Layout.from_json(json.loads(json.dumps(layout.to_json(), allow_nan=False))) == layout
+    for transform in ([1.0] * 5, [INFINITY] * 6, [HUGE] * 6, "x", None, 3):
+        damaged = changed.to_json()
+        damaged["maps"][0]["transform"] = transform
+        with pytest.raises((TypeError, ValueError, OverflowError)):
+            Layout.from_json(damaged)
+    assert different_transforms(changed.maps) == (
+        'the maps "albedo" (none) and "normal" (uv transform [2 0 0.25, 0.5 -1 1]) differ in their texture transforms'
+    )
+    assert not different_transforms((placed, MAPS[5]))  # the last map is constant
 
 
 INFINITY, HUGE = float("inf"), 10**400

@@ -15,10 +15,12 @@ from texture_files import make, material
 
 import mi_diffind
 from mi_diffind import plugins
+from mi_diffind.arrays.tables import save_table
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.measure.clock import bsdf_operations
 from mi_diffind.plugins.support import footprint
 from mi_diffind.scenes import loading
+from mi_diffind.tasks.texture import TASK
 
 WIDTH, HEIGHT = 32, 16
 
@@ -132,6 +134,33 @@ def test_equals_separate_plugins(mi, files, rng, reading, two_sided):
     ours = {"type": "neural_material", "filename": files["metal"], "two_sided": two_sided, **constants, **reading}
     theirs = {"type": "twosided", "inner": theirs} if two_sided else theirs
     assert_equal(mi, rng, mi.load_dict(ours), mi.load_dict(theirs), two_sided)
+
+
+@pytest.mark.parametrize("reading", [{}, {"filter": "anisotropic"}])
+def test_transform_and_sides_of_the_file(mi, files, rng, tmp_path, reading):
+    """The file's texture transform comes before ``to_uv``, and its two sides are those of ``twosided``."""
+    turn = mi.ScalarTransform4f().translate([0.3, -0.2, 0]).rotate([0, 0, 1], 30).scale([1.5, -0.4, 1])
+    place = mi.ScalarTransform4f().scale([2, 3, 1])
+    table = TASK.load(files["metal"])
+    layout, path = table.settings["layout"], str(tmp_path / "placed.npz")
+    layout["double_sided"] = True
+    for entry in layout["maps"]:
+        entry["transform"] = [float(turn.matrix[i, j]) for i in (0, 1) for j in (0, 1, 3)]
+    save_table(path, table)
+    ours = {"type": "neural_material", "filename": path, "to_uv": place, **reading}
+    theirs = {**ours, "filename": files["metal"], "to_uv": place @ turn}
+    assert_equal(mi, rng, mi.load_dict(ours), mi.load_dict({"type": "twosided", "inner": theirs}), True)
+    assert_equal(mi, rng, mi.load_dict({**ours, "two_sided": False}), mi.load_dict(theirs), False)
+    del layout["maps"][1]["transform"]
+    save_table(path, table)
+    assert 'the maps "albedo" (uv transform [1.299 0.2 0.3, 0.75 -0.3464 -0.2]) and "normal" (none) differ in' in (
+        texture_scenes.refused(mi, ours)
+    )
+    for name, to_uv in (("albedo", place @ turn), ("normal", place)):
+        texture = {"type": "neural_texture", "channels": name, **reading}
+        pair = {**texture, "filename": path, "to_uv": place}, {**texture, "filename": files["metal"], "to_uv": to_uv}
+        a, b = (mi.load_dict(one).eval_3(hits(mi, np.random.default_rng(1), 500)).numpy() for one in pair)
+        np.testing.assert_allclose(a, b, atol=1e-5)
 
 
 def test_equals_separate_plugins_in_every_variant(mi_any, files, rng):

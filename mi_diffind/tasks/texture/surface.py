@@ -20,7 +20,7 @@ from ...arrays.boxes import ValueBounds
 from ...core.compat import backend_module
 from ...core.errors import UsageError
 from ...images import srgb
-from ...maps.layout import Layout, MapLayout
+from ...maps.layout import Layout, MapLayout, different_transforms
 from ...maps.pyramid import FilteredMaps
 from ..disney import TASK as DISNEY
 from ..disney.decoder import Decoder, Lobe
@@ -65,13 +65,14 @@ def maps_of(layout: Layout) -> dict[str, MapLayout]:
         by_role[m.role] = m
     if not by_role:
         raise UsageError(f"source: found no map that shading reads, these are {', '.join(READ)}")
+    if fault := different_transforms(by_role.values()):
+        raise UsageError(f"source: {fault}")
     return by_role
 
 
 def varies_shading(layout: Layout) -> bool:
     """Return whether footprints show another shading than the mean of their maps: normals or roughness vary."""
-    varying = [m for m in layout.maps if any(isinstance(channel, int) for channel in m.where)]
-    return any(m.role in ("normal", "roughness") for m in varying)
+    return any(m.role in ("normal", "roughness") and m.varies for m in layout.maps)
 
 
 def left_out(layout: Layout) -> dict[str, str]:
