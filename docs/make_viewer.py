@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 OPTIONS = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-background-networking"]
 
 #: Samples a pixel that are waited for.
-SAMPLES = "256"
+SAMPLES = "96"
 
 
 def main() -> None:
@@ -36,14 +36,14 @@ def main() -> None:
                 profile, executable_path=program, viewport={"width": 1180, "height": 620}, args=OPTIONS
             )
             page = browser.new_page()
+            page.set_default_timeout(600_000)
             page.goto(url)
             page.locator("xpath=//label[normalize-space()='find']/following::input").first.fill("clay")
-            page.get_by_text("Software WebGL").locator("xpath=following::button | preceding::button").last.wait_for()
-            notice = page.locator(".mantine-Notification-closeButton")
-            for _ in range(notice.count()):
-                notice.first.click()
             while not re.search(rf"samples\s+{SAMPLES} of", page.inner_text("body")):
                 time.sleep(0.5)
+            notice = page.locator(".mantine-Notification-closeButton")  # the browser has no GPU
+            for _ in range(notice.count()):
+                notice.first.click()
             time.sleep(2)
             image = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
             browser.close()

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+from labelled import labelled
+from PIL import Image
 
 import mi_diffind
 
@@ -22,6 +24,9 @@ PLASTIC = {
     "nonlinear": True,
     "diffuse_reflectance": {"type": "rgb", "value": [0.1, 0.27, 0.36]},
 }
+
+#: Titles of the columns of the picture.
+TITLES = ("sources: principled, roughplastic", "neural_bsdf, parameters from textures")
 
 #: Roughness of the stripes.
 ALPHAS = (0.02, 0.08, 0.25, 0.7)
@@ -102,7 +107,8 @@ def main() -> None:
         at_least = "at least " if error < noise else ""
         print(f"{Path(learned['filename']).name}: {at_least}{-10 * math.log10(max(error, noise)):.1f} dB")
         rows.append(np.concatenate([p.mean(axis=0) for p in pair], axis=1))
-    mi.util.write_bitmap(str(SCENES / "families.jpg"), np.concatenate(rows).astype(np.float32))
+    shown = mi.util.convert_to_bitmap(np.concatenate(rows).astype(np.float32))
+    labelled(Image.fromarray(np.array(shown)), TITLES).save(SCENES / "families.jpg", quality=90)
 
 
 if __name__ == "__main__":

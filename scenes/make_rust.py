@@ -12,7 +12,8 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from labelled import labelled
+from PIL import Image
 from scene_xml import ball, element, head, lying, plugin, ref, repeated, write
 
 import mi_diffind as md
@@ -86,11 +87,7 @@ def picture(json_file: str | None) -> None:
     columns = [[image[CROP], image[ZOOM].repeat(3, axis=0).repeat(3, axis=1)] for image in (*images.values(), truth)]
     shown = np.concatenate([np.concatenate(column) for column in columns], axis=1)
     shown = mi.Bitmap(EXPOSURE * shown).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
-    strip = Image.new("RGB", (shown.width(), 18), "white")
-    for i, title in enumerate(TITLES):
-        place = i * shown.width() // len(TITLES) + 2, 1
-        ImageDraw.Draw(strip).text(place, title, "black", ImageFont.load_default(size=12))
-    mi.Bitmap(np.concatenate([strip, shown])).write(str(FOLDER / "rust.jpg"), quality=85)
+    labelled(Image.fromarray(np.array(shown)), TITLES).save(FOLDER / "rust.jpg", quality=85)
     text = json.dumps(figures, indent=2) + "\n"
     print(text, end="")
     if json_file:

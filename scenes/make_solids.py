@@ -9,8 +9,8 @@ import mitsuba as mi
 from scene_xml import Whole, environment, head, lying, place, plugin, principled, ref, softbox, transform, turn, write
 
 ABOUT = """Signed distance fields beside and in the place of meshes: Suzanne as a mesh (left) and as a field (right, the
-same clay), a knot of gold that casts a shadow on the latter, one behind a pane of glass, one of glass. Written by
-make_solids.py: change that file.
+same clay), a knot of gold that casts a shadow on the latter, a blue one, one of glass. Written by make_solids.py:
+change that file.
 
 "-D trace=grid -D integrator=path" decodes the fields to grids that any integrator traces."""
 
@@ -33,9 +33,6 @@ def main() -> None:
     glass = plugin("bsdf", "dielectric", id="glass", int_ior=1.5)
     blue = principled(id="blue", base_color=(0.08, 0.2, 0.5), roughness=0.25)
     floor = plugin("bsdf", "diffuse", reflectance=(0.55, 0.53, 0.5))
-    pane = plugin("shape", "cube", transform(
-        scale={"x": 0.55, "y": 0.7, "z": 0.02}, rotate=turn("y", -12), translate=place(2.05, 0.7, 0.75),
-    ), ref("glass"))  # fmt: skip
     content += [
         "A room by day, and a softbox from the right",
         environment("interior.exr", 0.35, 60.0),
@@ -46,10 +43,9 @@ def main() -> None:
         plugin("shape", "ply", transform(rotate=turn("y", 14), translate=place(-1.7, 0, 0)), ref("clay"),
                filename="assets/suzanne.ply"),
         solid("suzanne", ref("clay"), rotate=turn("y", -8), translate=place(0.35, 0, -0.2)),
-        "A knot that casts a shadow on the field, one behind a pane, one of glass",
+        "Knots: one that casts a shadow on the field, one on the floor, one of glass",
         solid("knot", ref("gold"), scale={"value": 0.36}, rotate=turn("x", 35), translate=place(1.4, 1.6, 0.85)),
         solid("knot", ref("blue"), scale={"value": 0.6}, rotate=turn("y", 60), translate=place(2.0, 0, -0.35)),
-        pane,
         solid("knot", ref("glass"), scale={"value": 0.5}, rotate=turn("x", 75), translate=place(-0.7, 0.45, 1.5)),
     ]  # fmt: skip
     write(FOLDER / "solids.xml", ABOUT, content)

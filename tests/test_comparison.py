@@ -3,6 +3,7 @@
 import json
 import signal
 from pathlib import Path
+from unittest import mock
 
 import mitsuba as mi
 import numpy as np
@@ -78,7 +79,10 @@ TEXTURED = """
 
 
 def test_a_filtered_texture_has_two_truths(mi_rgb, tmp_path):
-    """The mip map at equal samples and the bitmap at eight times as many; other learned plugins are exact in both."""
+    """The mip map at equal samples and the bitmap at eight times as many; other learned plugins are exact in both.
+
+    The figure has the truth on the left.
+    """
     path = tmp_path / "scene.xml"
     path.write_text(TEXTURED.replace("FILE", str(ASSETS / "tiles_filtered.npz")))
     first = comparison.compare(path, spp=8, passes=2, progress=False)
@@ -92,7 +96,10 @@ def test_a_filtered_texture_has_two_truths(mi_rgb, tmp_path):
     text = str(first)
     assert "against     mipmap (disney, mipmap), 8 spp" in text
     assert "against     exact (disney, bitmap), 64 spp" in text
-    paths = first.save(tmp_path / "out")
+    with mock.patch.object(comparison.figure_grid, "picture", wraps=comparison.figure_grid.picture) as cell:
+        paths = first.save(tmp_path / "out")
+    drawn = [call.args[1].mean() for call in cell.call_args_list]
+    assert drawn[::4] == [first.reference.mean(), second.reference.mean()] and drawn[1] == first.written.mean()
     assert sorted(paths) == ["error_exact", "error_mipmap", "exact", "figure", "mipmap", "written"]
     alone = mi_diffind.compare(path, spp=2, passes=1, progress=False, against="mipmap")
     picture = Path(alone.save(tmp_path / "alone")["figure"]).read_bytes()

@@ -104,10 +104,10 @@ def test_while_it_moves_each_side_renders_its_part(mi_rgb):
     shown.reduction = 2
     picture = shown.moving_picture()
     assert picture.shape == (HEIGHT // 2, WIDTH // 2, 3)
-    assert shown.learned.region == (12, 8, 0, 3) and shown.exact.region == (12, 8, 3, 12)
-    assert (picture[:, 3] == 255).all() and (shown.learned.image[:, 3:] == 0).all()
+    assert shown.exact.region == (12, 8, 0, 3) and shown.learned.region == (12, 8, 3, 12)
+    assert (picture[:, 3] == 255).all() and (shown.exact.image[:, 3:] == 0).all()
     # A sample of the ball may be black
-    assert (shown.learned.image[:, :3] > 0).mean() > 0.9 and (shown.exact.image[:, 3:] > 0).mean() > 0.9
+    assert (shown.exact.image[:, :3] > 0).mean() > 0.9 and (shown.learned.image[:, 3:] > 0).mean() > 0.9
     assert shown.figures["psnr_db"] is None and shown.figures["width"] == 12
     for divider in (0, 1):
         shown.show(divider=divider)
@@ -132,15 +132,15 @@ def test_an_oversampled_truth_has_more_samples_unless_the_camera_moves(mi_rgb):
 
 
 def test_divider_and_difference(rng):
-    learned, exact = (rng.uniform(-0.2, 1.3, (5, 10, 3)).astype(np.float32) for _ in range(2))
-    shown = combine(learned, exact, "side by side", 0.4, 1.0)
-    for side, columns in ((learned, slice(0, 4)), (exact, slice(5, None))):
+    exact, learned = (rng.uniform(-0.2, 1.3, (5, 10, 3)).astype(np.float32) for _ in range(2))
+    shown = combine(exact, learned, "side by side", 0.4, 1.0)
+    for side, columns in ((exact, slice(0, 4)), (learned, slice(5, None))):
         expected = 255 * srgb.from_linear(np.clip(side, 0, 1))
         assert np.abs(shown[:, columns] - expected[:, columns]).max() <= 0.5 + 1e-3
     assert (shown[:, 4] == 255).all()
-    a, b = (np.minimum(np.maximum(side, 0), 1) for side in (learned, exact))
+    a, b = (np.minimum(np.maximum(side, 0), 1) for side in (exact, learned))
     difference = 255 * srgb.from_linear(np.minimum(3 * np.abs(a - b), 1))
-    assert np.abs(combine(learned, exact, "difference", 0.4, 3.0) - difference).max() <= 0.5 + 1e-3
+    assert np.abs(combine(exact, learned, "difference", 0.4, 3.0) - difference).max() <= 0.5 + 1e-3
 
 
 def test_parameters_are_numbers_and_colours(mi_rgb):

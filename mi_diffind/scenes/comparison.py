@@ -82,21 +82,21 @@ class Comparison:
     def _write_figure(self, path: str | os.PathLike) -> None:
         """Write one picture.
 
-        Two rows for each truth, the scene as written, the truth and their difference, above as a whole and below its
-        worst place, and a row with the figures.
+        Two rows for each truth show the truth, the scene as written and their difference: above as a whole, below its
+        worst place. The last row has the figures.
         """
         learned = " (learned tables)" if self.figures["learned_plugins"] else ""
         written, cells = "learned plugins" if self.figures["conversions"] else f"as written{learned}", []
         for one in (self, *self.further):
             x, y, width, height = frame = tuple(one.figures["worst"][key] for key in ("x", "y", "width", "height"))
             inside, place = np.s_[y : y + height, x : x + width], f"{width} x {height} pixels from ({x}, {y})"
-            zoomed = one.written[inside], one.reference[inside]
+            zoomed = one.reference[inside], one.written[inside]
             cells += [
-                figure_grid.picture(f"{written}, {one.figures['spp']} spp", one.written, frame),
                 figure_grid.picture(one.truth, one.reference, frame),
+                figure_grid.picture(f"{written}, {one.figures['spp']} spp", one.written, frame),
                 figure_grid.error_map(np.abs(one.written - one.reference).mean(axis=-1)),
-                figure_grid.picture(f"{written}, worst place: {place}", zoomed[0]),
-                figure_grid.picture(f"{one.truth}, worst place", zoomed[1]),
+                figure_grid.picture(f"{one.truth}, worst place: {place}", zoomed[0]),
+                figure_grid.picture(f"{written}, worst place", zoomed[1]),
                 figure_grid.error_map(_clipped_error(*zoomed), "worst place, difference clipped to [0, 1]"),
             ]
         cells += [figure_grid.text(lines) for lines in self._sections()]

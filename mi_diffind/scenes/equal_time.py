@@ -57,7 +57,7 @@ class EqualTime:
         """Write ``equal_time.png`` into ``folder``, made if its parent exists, and return the paths."""
         path = writable_folder(folder, create=True) / "equal_time.png"
         pictures, error_maps = [], []
-        for name, image in self.images.items():
+        for name, image in reversed(self.images.items()):  # the exact one is the last
             c, error = self.figures["contenders"][name], _weighted((image - self.reference) ** 2, self.reference)
             title = f"{name} ({', '.join(c['plugins'])}): {c['spp']} samples a pixel, {c['seconds']['median']:.2g} s"
             pictures.append(plot.picture(title, image))

@@ -233,7 +233,7 @@ class Session:
             first, after = 0, width
             if self.moving and self.view == VIEWS[0]:
                 column = round(self.divider * width)
-                first, after = (0, column) if side is self.learned else (column, width)
+                first, after = (0, column) if side is self.exact else (column, width)
             if first < after:
                 side.add_pass((width, height, first, after), self.spp, self.seed, self.moving)
             else:
@@ -288,13 +288,13 @@ class Session:
     def picture(self) -> np.ndarray:
         """Return the picture, as bytes for a screen ``(height, width, 3)``.
 
-        Side by side, the learned scene is left of a white line at ``divider``, the exact one right of it. The
+        Side by side, the exact scene is left of a white line at ``divider``, the learned one right of it. The
         difference is the absolute one of values clipped to [0, 1], times ``gain``, grey where colours agree in it.
         """
         sides = self._visible()
         if len(sides) == 1:
             return displayed(sides[0].image)
-        return combine(self.learned.image, self.exact.image, self.view, self.divider, self.gain)
+        return combine(self.exact.image, self.learned.image, self.view, self.divider, self.gain)
 
     @property
     def figures(self) -> dict:
@@ -340,13 +340,13 @@ def rigid(to_world: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def combine(learned: np.ndarray, exact: np.ndarray, view: str, divider: float, gain: float) -> np.ndarray:
+def combine(exact: np.ndarray, learned: np.ndarray, view: str, divider: float, gain: float) -> np.ndarray:
     """Return two linear images ``(height, width, 3)`` side by side, or their difference, as bytes for a screen."""
     if view == "difference":
-        return displayed(gain * np.abs(np.clip(learned, 0, 1) - np.clip(exact, 0, 1)))
-    width = learned.shape[1]
+        return displayed(gain * np.abs(np.clip(exact, 0, 1) - np.clip(learned, 0, 1)))
+    width = exact.shape[1]
     column = round(divider * width)
-    shown = displayed(np.concatenate([learned[:, :column], exact[:, column:]], axis=1))
+    shown = displayed(np.concatenate([exact[:, :column], learned[:, column:]], axis=1))
     if 0 < column < width:
         shown[:, column] = 255
     return shown
