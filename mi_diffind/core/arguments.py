@@ -136,17 +136,13 @@ def define(text: str) -> tuple[str, str]:
 
 
 def checked(parse):
-    """Make a type of ``argparse`` from a parser that raises ``ValueError``, so that its message is shown.
-
-    The type returns the text itself.
-    """
+    """Make a type of ``argparse`` from a parser that raises ``ValueError``, so that its message is shown."""
 
     def parsed(text: str):
         try:
-            parse(text)
+            return parse(text)
         except ValueError as e:
             raise argparse.ArgumentTypeError(str(e)) from None
-        return text
 
     return parsed
 

@@ -18,7 +18,7 @@ from ..core.errors import UsageError, printable
 from ..core.files import replacing
 from ..core.threads import threads_for_files
 from ..fitting.loop import FitResult, Problem
-from ..fitting.task import FitRequest, Fitted, Model
+from ..fitting.task import FitRequest, Fitted, Model, significant
 from ..images import srgb
 from . import as_seen
 from .layout import Layout
@@ -242,11 +242,6 @@ def complete(
     fitted.lines += [*lines, *source.notes]
     fitted.figures = {**figures, "origins": list(source.origins), **fitted.figures}
     return fitted
-
-
-def significant(figures: Mapping[str, float]) -> dict[str, float]:
-    """Return figures with five digits, as a table file holds them."""
-    return {name: float(f"{value:.5g}") for name, value in figures.items()}
 
 
 class MapsModel(Model):
