@@ -8,8 +8,6 @@ Learned forms replace some of its methods by reads (:class:`.factored.FactoredDe
 (:class:`.paper.PaperDecoder`). Sampling and densities (:mod:`.sampling`) always use the analytic coefficients.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -35,7 +33,7 @@ GROUPS = {
 class Decoder:
     """Analytic form of the model.
 
-    In all methods, ``p`` is an object with the parameters, all in [0, 1], ``albedo`` (a colour)
+    In all methods, ``p`` is an object with the sanitised parameters (:func:`.model.sanitize`), ``albedo`` (a colour)
     and ``luminance`` as attributes; ``c`` maps groups to coefficients; ``e`` are the effects in use; ``g`` is the
     geometry of a pair of directions (:func:`.model.geometry`).
     """

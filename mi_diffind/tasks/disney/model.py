@@ -17,14 +17,13 @@ Parts that a material does not use are neither traced nor read nor sampled (:fun
 parameters). No value changes: each part has a factor that is exactly 0 for every value that the parameter can take.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from typing import Any
 
 import drjit as dr
 
 from ...arrays.boxes import ValueBounds
+from ...arrays.lookup import clamp
 
 #: Smallest GGX roughness α, as in Mitsuba's ``principled``.
 ALPHA_MIN = 1e-3
@@ -236,6 +235,11 @@ def tint(albedo, luminance):
 def specular_from_eta(eta):
     """Return ``specular`` of a relative index of refraction: reflectance ((η − 1)/(η + 1))² in units of 0.08."""
     return dr.square((eta - 1) / (eta + 1)) / SPECULAR_SCALE
+
+
+def sanitize(material: Material) -> Material:
+    """Clamp every parameter to [0, 1], NaN to 0, since textures and optimisers overshoot."""
+    return Material(**{name: clamp(getattr(material, name), 0.0, 1.0) for name in PARAMETERS})
 
 
 @dataclass(frozen=True)

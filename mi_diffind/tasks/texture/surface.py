@@ -9,15 +9,12 @@ Maps are known by their role: albedo, normal, roughness, metallic. A missing par
 ``disney``. Ambient occlusion and other maps are not shaded, since ``disney`` and ``principled`` have no such parameter.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
 from ...arrays.boxes import ValueBounds
-from ...arrays.lookup import clamp
 from ...core.compat import backend_module
 from ...core.errors import UsageError
 from ...images import srgb
@@ -25,7 +22,7 @@ from ...maps.layout import Layout, MapLayout
 from ...maps.pyramid import FilteredMaps
 from ..disney import TASK as DISNEY
 from ..disney.decoder import Decoder, Lobe
-from ..disney.model import PARAMETERS, Effects, Material, find_effects
+from ..disney.model import PARAMETERS, Effects, Material, find_effects, sanitize
 from ..disney.training import shade
 from .compressed import NEUTRAL
 
@@ -152,8 +149,7 @@ def shaded(decoder: Decoder | None, surface: SurfaceParameters, wi, wo, effects:
     up = type(wi)(0, 0, 1)
     wi_local, wo_local = dr.select(visible, wi_local, up), dr.select(visible, wo_local, up)
     given = {"roughness": Float(surface.roughness), "metallic": Float(surface.metallic)}
-    # Within [0, 1], since textures and optimisers overshoot
-    material = Material(**{name: clamp(given.get(name, Float(value)), 0.0, 1.0) for name, value in DEFAULTS.items()})
+    material = sanitize(Material(**{**{n: Float(v) for n, v in DEFAULTS.items()}, **given}))
     albedo, lobe = dr.maximum(surface.albedo, 0), surface.lobe
     if limit is None or "specular" not in effects.lobes:
         value = shade(decoder, material, albedo, wi_local, wo_local, effects, lobe=lobe)
