@@ -15,8 +15,6 @@ Conventions, the same everywhere in this package:
 Everything works on any JIT backend of Dr.Jit; nothing here knows Mitsuba.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Command-line arguments that tasks and studies declare, and parsers of their values."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Base class of all errors that a user can cause, and text from files in a form that a terminal may show."""
 
-from __future__ import annotations
-
 import unicodedata
 
 #: Most characters of a message.

@@ -12,8 +12,6 @@ run and no scene object exists. If no usable library exists, the LLVM backend is
 ``mi.set_variant("llvm_…")`` raises instead of aborting later; CUDA variants are not concerned.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import functools

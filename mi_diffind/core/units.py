@@ -1,7 +1,5 @@
 """Sizes as users write them (bytes, compression ratios, bits per texel), and figures as people read them."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -1,7 +1,5 @@
 """Entries of a material: which image, which channels of it and which factor make up each map."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from dataclasses import dataclass

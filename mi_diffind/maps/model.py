@@ -1,7 +1,5 @@
 """Table files of maps: their arrays, their pages, and the maps as a model that is measured and decoded."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Search for the smallest file of a wanted quality, by a few short trainings and one or more of full length."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

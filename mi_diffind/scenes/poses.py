@@ -1,7 +1,5 @@
 """Poses of cameras: evenly spread directions, look-at matrices and rotations about an axis."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -6,8 +6,6 @@ group ``mi_diffind.studies`` names, declares one. Studies load plugins, so this 
 comparisons in equal bytes, :mod:`.shaded_scenes` the renders of a study.
 """
 
-from __future__ import annotations
-
 import argparse
 import functools
 import importlib

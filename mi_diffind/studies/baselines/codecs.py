@@ -6,8 +6,6 @@ on them. An image whose sides are no multiples of the block size is padded by re
 padded blocks count.
 """
 
-from __future__ import annotations
-
 import functools
 import io
 import itertools

@@ -5,8 +5,6 @@ between ± ``band``; no step has its middle at zero, so no sign is lost. Bytes a
 and index.
 """
 
-from __future__ import annotations
-
 import math
 
 import drjit as dr

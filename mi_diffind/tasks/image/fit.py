@@ -1,7 +1,5 @@
 """``fit image``: checks of options, weights of maps, the choice of sizes by rule or by trainings, and the fit."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping

@@ -5,8 +5,6 @@ value at a jittered place within it. The supplement's recipe jitters all samples
 picture. Half of the steps at centres and half jittered is better both at texels and between them.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

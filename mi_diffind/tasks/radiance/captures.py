@@ -23,8 +23,6 @@ PNG and JPEG hold sRGB, not multiplied by alpha; EXR holds linear values multipl
 opaque everywhere.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import math

@@ -1,7 +1,5 @@
 """Table files of radiance fields: arrays of each layout, checks, and the field of a table."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """``fit field``: from a folder of views to a grid, from a grid to a compressed field, trained and measured."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import os

@@ -4,8 +4,6 @@ The primary arrays begin as ramps, the cascaded arrays as the grid resampled to 
 empty, as in all fields here; the supplement keeps them.
 """
 
-from __future__ import annotations
-
 import math
 
 import drjit as dr

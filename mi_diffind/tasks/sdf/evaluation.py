@@ -3,8 +3,6 @@
 All lengths are relative to the mesh's longest side.
 """
 
-from __future__ import annotations
-
 import drjit as dr
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Training of distance fields (``fit sdf``): from a mesh and a number of bytes to a table file."""
 
-from __future__ import annotations
-
 import sys
 import time
 

@@ -3,8 +3,6 @@
 Grids have cubic cells, ``resolution`` of them along the longest side of the field's box.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
 from collections.abc import Callable

@@ -4,8 +4,6 @@ All distances, tolerances and points of this task are in that frame; negative is
 Mitsuba's ``.serialized`` and its scenes are read. Repairs that "inside" depends on are listed in :attr:`Mesh.warnings`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib

@@ -1,7 +1,5 @@
 """Table files of distance fields: their arrays, the fields that they become, and what users do with them."""
 
-from __future__ import annotations
-
 import os
 import time
 from dataclasses import replace

@@ -5,8 +5,6 @@ mesh; their sides follow those of the box. The preset ``paper`` starts as the su
 distance itself.
 """
 
-from __future__ import annotations
-
 import drjit as dr
 import numpy as np
 from scipy.spatial import cKDTree

@@ -7,8 +7,6 @@ keeps; :mod:`.surface`: maps as parameters of the BRDF, and shading; :mod:`.appe
 measure, and a preview; :mod:`.fit`: the command ``fit texture``.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -10,8 +10,6 @@ and their mean is the reference. Three patterns of samples:
 - ``"jittered"``: 16 random samples of unfiltered maps, one in each of 4 × 4 strata: noisy, yet right on average.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -8,8 +8,6 @@
   levels, so at step 0 they are smaller pictures of fewer channels.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """``fit texture``: checks of options, the choice of a memory budget, and a training of one or two stages."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping

@@ -7,8 +7,6 @@ is lost where pixels are stretched along v alone. Differences of two readers hav
 decides nothing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any

@@ -8,8 +8,6 @@
 - **Choice.** Held-out footprints (:mod:`.heldout`) decide which arrays are kept, and at which level bias they are read.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Iterator
