@@ -76,29 +76,6 @@ def check_size(name: str, value: float, most: float) -> None:
         raise UsageError(f"{name}: found {value:,} bytes, a table file holds at most {most:,}")
 
 
-def parse_size(
-    uncompressed_bytes: int,
-    texels: int,
-    compression: str | float | None = None,
-    nbytes: str | float | None = None,
-    bpp: str | float | None = None,
-) -> int:
-    """Return a size in bytes (at least 1) from exactly one of a compression ratio, bytes and bits per texel.
-
-    ``compression`` divides ``uncompressed_bytes``, ``bpp`` counts bits for each of ``texels``. Raises ``ValueError``.
-    """
-    given = {"compression": compression, "bytes": nbytes, "bpp": bpp}
-    given = {name: value for name, value in given.items() if value is not None}
-    if len(given) != 1:
-        raise ValueError(f"size: found {', '.join(given) or 'nothing'}, give exactly one of compression, bytes and bpp")
-    if nbytes is not None:
-        return parse_bytes(nbytes)
-    wanted = parse_bpp(bpp) * texels / 8 if bpp is not None else uncompressed_bytes / parse_compression(compression)
-    if not math.isfinite(wanted):
-        raise ValueError(f"size: {next(iter(given))} {next(iter(given.values()))} is out of range")
-    return max(1, round(wanted))
-
-
 def _positive(text, ending: str, quantity: str, example: str) -> tuple[float, re.Match]:
     """Return the number before an ``ending`` (a regular expression), and the match. Raises ``ValueError``."""
     match = re.fullmatch(rf"(?P<number>{_NUMBER}){ending}", str(text).strip(), re.IGNORECASE | re.ASCII)

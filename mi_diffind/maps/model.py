@@ -1,5 +1,6 @@
 """Table files of maps: their arrays, their pages, and the maps as a model that is measured and decoded."""
 
+import math
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -90,16 +91,16 @@ def _page_entries(table: Table, name: str, size: tuple[int, int]) -> int:
 
 def requested_bytes(options, source: Source) -> int:
     """Return the bytes of the options :data:`SIZES`, by default a twelfth of the source's. Raises UsageError."""
-    given = {k: options[k] for k in ("compression", "bpp")} | {"nbytes": options["bytes"]}
-    if not any(given.values()):
-        given["compression"] = 12
-    try:
-        wanted = units.parse_size(source.nbytes, source.texels, **given)
-    except ValueError as e:
-        raise UsageError(str(e)) from None
-    if options["bytes"] is not None:
-        units.check_size("--bytes", wanted, MAX_BYTES)
-    return wanted
+    given = {name: options[name] for name in ("compression", "bytes", "bpp") if options[name] is not None}
+    if len(given) > 1:
+        raise UsageError(f"size: found {', '.join(given)}, give exactly one of compression, bytes and bpp")
+    if "bytes" in given:
+        units.check_size("--bytes", given["bytes"], MAX_BYTES)
+        return given["bytes"]
+    wanted = given["bpp"] * source.texels / 8 if "bpp" in given else source.nbytes / given.get("compression", 12)
+    if not math.isfinite(wanted):
+        raise UsageError(f"size: compression {given['compression']} is out of range")
+    return max(1, round(wanted))
 
 
 def requested_border(options) -> tuple[str, str] | None:
