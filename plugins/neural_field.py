@@ -649,9 +649,7 @@ def integrator() -> type:
 
 def open_model(props: mi.Properties):
     """Return the model that the properties ``filename`` and ``storage`` name."""
-    path, storage = properties.filename(props), properties.one_of(props, "storage", ("uint8", "float32"))
-    if not path:
-        raise RuntimeError('parameter "filename": not given, a file of "mi-diffind fit field" is needed')
+    path, storage = tables.file_and_storage(props, "field")
     from mi_diffind.tasks.radiance import TASK
 
     return TASK.open(mi.TensorXf, path, storage=storage if storage == "float32" else "")

@@ -3,10 +3,7 @@
 from __future__ import annotations  # Delayed parsing of type annotations
 
 import math
-import threading
 import time
-from pathlib import Path
-from weakref import WeakValueDictionary
 
 import mitsuba as mi
 import numpy as np
@@ -30,10 +27,7 @@ from .support.distance_shapes import (
 from .support.manual import shared_parts
 from .support.placement import Placement, similarity
 from .support.properties import Kept, StockNode
-
-#: Models whose arrays cannot be optimised, shared by all shapes of a file.
-_shared: WeakValueDictionary = WeakValueDictionary()
-_lock = threading.RLock()  # Mitsuba loads shapes in parallel; a thread that waits for a kernel may load another shape
+from .support.tables import file_and_storage, shared
 
 #: Cells along the longest side of the finest grid that is chosen automatically.
 FINEST = 512
@@ -46,16 +40,11 @@ TYPICAL_ERROR = 0.005
 
 
 def open_model(props: mi.Properties):
-    """Return the model that the properties ``filename`` and ``storage`` name."""
-    path, storage = properties.filename(props), properties.one_of(props, "storage", ("uint8", "float32"))
-    if not path:
-        raise RuntimeError('parameter "filename": not given, a file of "mi-diffind fit sdf" is needed')
+    """Return the model that the properties ``filename`` and ``storage`` name; all shapes of a file share bytes."""
+    path, storage = file_and_storage(props, TASK.name)
     if storage == "float32":
         return TASK.open(mi.TensorXf, path, storage=storage)
-    key = (path, stamp(Path(path)), mi.TensorXf)
-    with _lock:
-        model = _shared.get(key)
-        return model if model is not None else _shared.setdefault(key, TASK.open(mi.TensorXf, path))
+    return shared((TASK.name, path, *stamp(path), mi.TensorXf), lambda: TASK.open(mi.TensorXf, path))
 
 
 def decode_grid(model, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict]:
@@ -303,9 +292,7 @@ def _from_mesh(node: StockNode) -> str:
         limits = f"{LEAST_IOU:g} and {LARGEST_ANGLE:g}° are needed"
         raise Kept(f"{node.file().name} would have {quality}, {limits}: fit it by hand, with more bytes")
     props["filename"] = str(table.path)
-    for name in ("shape_index", "face_normals", "flip_normals", "flip_tex_coords"):
-        if name in props:
-            del props[name]
+    properties.remove(props, "shape_index", "face_normals", "flip_normals", "flip_tex_coords")
     lost = f", those of smooth shading, {smooth:.1f}° from the triangles, are lost" if smooth >= 0.05 else ""
     return f"{table.path.name}, {quality}{lost}"
 

@@ -54,6 +54,13 @@ def check_range(props: mi.Properties, name: str, low: float, high: float) -> Non
             raise RuntimeError(f'parameter "{name}": found {value:g}, allowed is [{low}, {high}]')
 
 
+def remove(props: mi.Properties, *names: str) -> None:
+    """Remove properties, those that are there."""
+    for name in names:
+        if name in props:
+            del props[name]
+
+
 def filename(props: mi.Properties) -> str:
     """Return the property ``filename`` as Mitsuba resolves it, or ""."""
     name = str(props.get("filename", ""))
