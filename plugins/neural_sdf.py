@@ -8,6 +8,7 @@ import time
 import mitsuba as mi
 import numpy as np
 
+from mi_diffind.core.errors import raised_as
 from mi_diffind.core.files import stamp
 from mi_diffind.tasks.sdf import TASK, grids, marching
 
@@ -238,10 +239,8 @@ def factory(props: mi.Properties):
     to_world = props.get("to_world", mi.ScalarTransform4f())
     similarity(to_world)  # raises for an invalid transform
     normals = properties.one_of(props, "normals", ("smooth", "analytic"))
-    try:
+    with raised_as(RuntimeError, RuntimeError, at=model.table.path):
         values, lower, upper, report = decode_grid(model, resolution)
-    except RuntimeError as e:
-        raise RuntimeError(f"{model.table.path}: {e}") from None
     to_unit = mi.ScalarTransform4f().translate(list(model.centre)).scale(model.scale)
     to_world = mi.ScalarTransform4f(np.array(to_world.matrix))
     shape, kept = native_grid(props, values, lower, upper, to_world @ to_unit, normals)
@@ -280,10 +279,8 @@ def _from_mesh(node: StockNode) -> str:
     if textures := materials + node.nested_types(mi.ObjectType.Texture):
         raise Kept(f"has a material with textures ({', '.join(textures)}), distance fields have no texture coordinates")
     node.allow("filename", "shape_index", "face_normals", "flip_normals", "flip_tex_coords", "to_world", "bsdf")
-    try:
+    with raised_as(Kept, RuntimeError, at="cannot be placed"):
         similarity(props.get("to_world", mi.ScalarTransform4f()))
-    except RuntimeError as e:
-        raise Kept(f"cannot be placed: {e}") from None
     source = closed_mesh_file(node.file(), node.folder, props.get("shape_index", 0))
     smooth = check_normals(props, source)
     table = node.fit(TASK.name, source, bytes=BYTES)

@@ -4,7 +4,7 @@ import argparse
 import math
 from collections.abc import Mapping
 
-from .errors import UsageError
+from .errors import UsageError, raised_as
 from .files import check_distinct
 
 #: Largest size or count: Dr.Jit and Mitsuba hold them in 32 bits.
@@ -47,10 +47,8 @@ class Argument:
         parse, plain = self.options.get("type"), isinstance(value, (str, int, float)) and not isinstance(value, bool)
         if parse is None or not plain or value in (self.default, math.inf):
             return value
-        try:
+        with raised_as(UsageError, argparse.ArgumentTypeError, ValueError, at=self.name):
             return parse(str(value))
-        except (argparse.ArgumentTypeError, ValueError) as e:
-            raise UsageError(f"{self.name}: {e}") from None
 
 
 def add_arguments(parser: argparse.ArgumentParser, arguments: tuple[Argument, ...]) -> None:
@@ -137,10 +135,8 @@ def checked(parse):
     """Make a type of ``argparse`` from a parser that raises ``ValueError``, so that its message is shown."""
 
     def parsed(text: str):
-        try:
+        with raised_as(argparse.ArgumentTypeError, ValueError):
             return parse(text)
-        except ValueError as e:
-            raise argparse.ArgumentTypeError(str(e)) from None
 
     return parsed
 

@@ -13,7 +13,7 @@ from ..arrays.indirection import DifferentiableArray
 from ..arrays.pages import SIDE_BITS, page_counts, page_shift
 from ..arrays.tables import MAX_BYTES, PAGES, Table, TableError, allocate_pages, page_sides
 from ..core import units
-from ..core.errors import UsageError, printable
+from ..core.errors import UsageError, printable, raised_as
 from ..core.files import replacing
 from ..core.threads import threads_for_files
 from ..fitting.loop import FitResult, Problem
@@ -78,10 +78,8 @@ def _page_entries(table: Table, name: str, size: tuple[int, int]) -> int:
     """Return the number of entries of the pages of an array, on an image of ``size``. Raises :class:`TableError`."""
     pages, counts, largest = table.arrays[name + PAGES], page_counts(size), 2 ** SIDE_BITS[1]
     where = f'{table.path}: array "{name}{PAGES}"'
-    try:
+    with raised_as(TableError, ValueError, at=where):
         sides = page_sides(pages)
-    except ValueError as e:
-        raise TableError(f"{where}: {e}") from None
     if sides.shape != (*counts, 2):
         raise TableError(f"{where} has the shape {sides.shape}, expected {(*counts, 2)}")
     if sides.max() > largest:

@@ -60,8 +60,8 @@ def search_by_psnr(
 
     Sizes follow the secant of quality over the logarithm of bytes. Short trainings find where the quality is near;
     trainings of full length, of ``settings.steps`` steps, end within :data:`EXCESS_DB` of the goal, or where a
-    sufficient size is within :data:`NEAR` of an insufficient one, or after :data:`TRAININGS`. No size is
-    larger than the source.
+    sufficient size is within :data:`NEAR` of an insufficient one, or after :data:`TRAININGS`. No size
+    is larger than the source.
 
     Returns the table, the record of its training, and all trainings (``bytes``, ``steps``, ``psnr_db``). After Ctrl-C
     the record is marked ``interrupted``. Raises :class:`FittingError`, or after Ctrl-C ``KeyboardInterrupt``, if no

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...arrays.tables import MAX_BYTES, Table, save_table
 from ...core import units
-from ...core.errors import UsageError
+from ...core.errors import UsageError, raised_as
 from ...core.files import check_distinct
 from ...core.progress import Deadline, interruptible
 from ...fitting.loop import FitResult, FittingError, cores
@@ -354,11 +354,9 @@ class FieldFit:
         if disk is not None:
             coding = self.coding_in_file(grid, disk)
         else:
-            try:
+            given = "bytes" if self.request.options["bytes"] is not None else "compression"
+            with raised_as(UsageError, ValueError, at=f"--{given}"):
                 grid, bits = compression.in_memory(grid, self.session.seeing_images, self.wanted_bytes(grid))
-            except ValueError as e:
-                given = "bytes" if self.request.options["bytes"] is not None else "compression"
-                raise UsageError(f"--{given}: {e}") from None
             importance, limit = self.importance(grid)
             palette = compression.sorted_clusters(grid, importance, limit, 2**bits, seed)
             rate = compression.SLOPE * importance.loss / grid.nodes.count

@@ -10,7 +10,7 @@ from ...arrays.budget import Budget, BudgetError
 from ...arrays.indirection import device_array, device_tensor
 from ...arrays.tables import MAX_BYTES, Table
 from ...core import units
-from ...core.errors import UsageError
+from ...core.errors import UsageError, raised_as
 from ...fitting.loop import Problem
 from ...fitting.task import FitRequest, Fitted, FittingError
 from . import TASK, encoding
@@ -240,12 +240,10 @@ def search_grid(distances: Distances, nbytes: int, bits: int) -> encoding.Sample
         aim = spacing * np.sqrt(expected / max((1 - TOLERANCE / 2) * nbytes - fixed, 1))
         return float(np.clip(aim, FINEST_SPACING, COARSEST_SPACING))
 
-    try:
+    with raised_as(UsageError, BudgetError, at="--bytes"):
         best = budget.approach(
             lambda spacing: encoding.sample(distances, spacing, bits), FIRST_SPACING, following, attempts=6
         )
-    except BudgetError as e:
-        raise UsageError(f"--bytes: {e}") from None
     if best.structure.nodes == 0:
         raise FittingError(
             f"{distances.mesh.path}: the solid is thinner than the cells of {nbytes:,} bytes, "

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from ...arrays.budget import Budget, BudgetError, proportional_shape
 from ...arrays.indirection import DifferentiableArray, Indirection, device_array, ramp, rounded, stored_form
 from ...arrays.tables import StoredArray, Table
-from ...core.errors import UsageError
+from ...core.errors import UsageError, raised_as
 from ...fitting.loop import Problem
 from .distances import Distances, sample_box, sample_near
 from .evaluation import HELD_OUT, HeldOut
@@ -94,11 +94,9 @@ def resolutions(nbytes: int, ratio: float, extent) -> tuple[tuple[int, ...], tup
     def shapes(n: int) -> tuple:
         return proportional_shape(n, extent), proportional_shape(n / ratio, extent)
 
-    try:
+    with raised_as(UsageError, BudgetError, at="--bytes"):
         sides = range(4, max(5, nbytes))
         return shapes(Budget(nbytes).largest(lambda n: [((*shapes(n)[0], 3), 8), (shapes(n)[1], 8)], sides))
-    except BudgetError as e:
-        raise UsageError(f"--bytes: {e}") from None
 
 
 def initial(start: str, primary, cascaded, grid_distance, samples, distances, band: float) -> Indirection:

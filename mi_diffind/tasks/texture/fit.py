@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ...arrays.tables import MAX_BYTES, Table
-from ...core.errors import UsageError
+from ...core.errors import UsageError, raised_as
 from ...core.progress import interruptible
 from ...core.units import figure_lines
 from ...fitting.task import FitRequest, FitResult, Fitted
@@ -181,10 +181,8 @@ def fit_stages(request: FitRequest, source: Source, pyramid: Pyramid) -> tuple[F
             lines = ["not trained for its shading: interrupted"]
             return Fitted(table, dataclasses.replace(result, interrupted=True), lines), requested, room
         lines += [f"the training for its maps: {result.outcome}"] * result.unfinished
-    try:
+    with raised_as(UsageError, ValueError):
         net = trainable_arrays(table, pyramid)
-    except ValueError as e:
-        raise UsageError(str(e)) from None
     nbytes = table.nbytes
 
     def build(weights: Mapping[str, float]) -> TextureProblem:
@@ -281,7 +279,5 @@ def _layered_size(pyramid: Pyramid, nbytes: float, structure, skip: int | None, 
             structure == "pages" or gain_of_pages(finest, size.dims, size.page_entries, pyramid.border)[0] >= GAIN_DB
         ):
             return size
-    try:
+    with raised_as(UsageError, ValueError, at="--structure"):
         return arrays.choose(*shape, nbytes, skip, fine, cascaded, arrays.ladder(smoothness(pyramid.values[0])))
-    except ValueError as e:
-        raise UsageError(f"--structure: {e}") from None
