@@ -150,6 +150,8 @@ def test_a_size_is_asked_for_in_one_way():
         size(compression=12.0, bpp=2.0)
     with pytest.raises(UsageError, match="out of range"):
         size(compression=1e-320)
+    with pytest.raises(UsageError, match="bpp 1e308 is out of range"):
+        size(bpp=1e308)
 
 
 def test_more_than_fits_is_refused(monkeypatch):

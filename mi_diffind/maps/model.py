@@ -97,7 +97,8 @@ def requested_bytes(options, source: Source) -> int:
         return given["bytes"]
     wanted = given["bpp"] * source.texels / 8 if "bpp" in given else source.nbytes / given.get("compression", 12)
     if not math.isfinite(wanted):
-        raise UsageError(f"size: compression {given['compression']} is out of range")
+        name, value = next(iter(given.items()))
+        raise UsageError(f"size: {name} {value} is out of range".replace("e+", "e"))
     return max(1, round(wanted))
 
 
