@@ -11,6 +11,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any
 
 from mi_diffind.core import compat, discovery
@@ -130,7 +131,10 @@ class Plugin:
             return float(props[key])
         if word == "colour":
             return [float(v) for v in props[key]]
-        return _rows(props[key].matrix) if is_transform else str(props[key])
+        if is_transform:
+            matrix = props[key].matrix
+            return [[float(matrix[i, j]) for j in range(4)] for i in range(4)]
+        return str(props[key])
 
 
 #: Variant that was set → its plugins by name.
@@ -224,19 +228,13 @@ def _checking_factory(plugin: Plugin):
         part = _parts.pop(id(instance), instance)
         _forget_dead()  # a dead ``roughplastic`` of Mitsuba's would keep functions from being frozen
         if hasattr(part, "__dict__"):
-            part._origin = _Origin(description)
+            # No dictionary, in whose entries ``dr.freeze`` would look for arrays
+            part._origin = SimpleNamespace(description=description)
         else:
             _native.setdefault(id(part), [part, description, None])[1] = description
         return instance
 
     return make
-
-
-class _Origin:
-    """Description of an instance; no dictionary, in whose entries ``dr.freeze`` would look for arrays."""
-
-    def __init__(self, description: dict):
-        self.description = description
 
 
 def warn(text: str) -> None:
@@ -288,7 +286,3 @@ def report(instance) -> dict | None:
         return instance.report()
     entry = _native.get(id(instance))
     return None if entry is None or entry[2] is None else entry[2]()
-
-
-def _rows(matrix) -> list[list[float]]:
-    return [[float(matrix[i, j]) for j in range(4)] for i in range(4)]

@@ -568,11 +568,7 @@ def check_principled(node: StockNode) -> None:
             raise Kept(f"has the {value}, below {least:g} the Disney BRDF reflects more at grazing angles")
 
 
-def _from_principled(node: StockNode) -> str:
-    check_principled(node)
-    return ""
-
-
 PLUGIN = Plugin(
-    "disney", "bsdf", Disney, others=(PRINCIPLED,), stock=Stock("disney", ("principled",), _from_principled)
+    "disney", "bsdf", Disney, others=(PRINCIPLED,),
+    stock=Stock("disney", ("principled",), lambda node: check_principled(node) or ""),
 )  # fmt: skip

@@ -2,6 +2,8 @@
 
 from __future__ import annotations  # Delayed parsing of type annotations
 
+from types import SimpleNamespace
+
 import drjit as dr
 import mitsuba as mi
 
@@ -13,16 +15,6 @@ from . import Plugin
 from .support.image_files import SharedMaps, open_uncompressed
 from .support.manual import shared_parts
 from .support.map_textures import FilteredTexture
-
-
-class Texels:
-    """Holder of the parameter ``data``, which frozen functions (``dr.freeze``) do not read and must not look for.
-
-    ``accepted`` is its last value of an allowed shape.
-    """
-
-    def __init__(self, tensor: mi.TensorXf):
-        self.tensor, self.accepted = tensor, dr.detach(tensor)
 
 
 @shared_parts
@@ -106,7 +98,9 @@ class MipMap(FilteredTexture):
 
     def traverse(self, cb: mi.TraversalCallback):
         if self._data is None:
-            self._data, self._entry = Texels(self._finest()), self.map
+            tensor = self._finest()
+            # Frozen functions (dr.freeze) do not read it and must not look for it. ``accepted``: its last allowed value
+            self._data, self._entry = SimpleNamespace(tensor=tensor, accepted=dr.detach(tensor)), self.map
         cb.put("data", self._data.tensor, mi.ParamFlags.Differentiable)
         super().traverse(cb)
 

@@ -202,13 +202,6 @@ def has_smooth(scene: mi.Scene) -> bool:
     )
 
 
-def with_holes(scene: mi.Scene) -> list[str]:
-    """Return the names of shapes whose material has holes, such as a ``mask``."""
-    flags = {shape.id(): shape.bsdf().flags() for shape in scene.shapes() if shape.bsdf() is not None}
-    both = mi.BSDFFlags.Null, mi.BSDFFlags.Smooth
-    return [name for name, of_shape in flags.items() if all(mi.has_flag(of_shape, flag) for flag in both)]
-
-
 @cache
 def integrator() -> type:
     """Return the class of the plugin in the current variant."""
@@ -233,10 +226,7 @@ def integrator() -> type:
             if field is None:
                 self.model = open_model(props)
                 field = self.model.field
-            shown = props.get("surroundings", True)
-            if not isinstance(shown, bool):
-                raise RuntimeError(f'parameter "surroundings": found {shown}, allowed are true and false')
-            if field.unbounded and not shown:
+            if not properties.flag(props, "surroundings", True) and field.unbounded:
                 field = field.without_surroundings()
             self.placed = PlacedField(field, props.get("to_world", mi.ScalarTransform4f()))
             self._entries = tables.Entries(self.placed.exposed)
@@ -247,9 +237,7 @@ def integrator() -> type:
                 self.surfaces = self.nested.surfaces
             if len(self.fields) > MOST:
                 raise RuntimeError(f"found {len(self.fields)} nested fields, allowed are {MOST}")
-            self.lit = props.get("lit", False)
-            if not isinstance(self.lit, bool):
-                raise RuntimeError(f'parameter "lit": found {self.lit}, allowed are true and false')
+            self.lit = properties.flag(props, "lit")
             self._group()
             self._warned = False
             omissions.watch(self)
@@ -394,7 +382,9 @@ def integrator() -> type:
         def _unseen(self, scene) -> str:
             """Return a sentence on where the field is not seen in a scene, or ``""``."""
             if not self.lit:
-                holes = with_holes(scene)
+                flags = {shape.id(): shape.bsdf().flags() for shape in scene.shapes() if shape.bsdf() is not None}
+                both = mi.BSDFFlags.Null, mi.BSDFFlags.Smooth
+                holes = [name for name, some in flags.items() if all(mi.has_flag(some, flag) for flag in both)]
                 return f'the field is not visible through the holes of "{holes[0]}", "lit" shows it' if holes else ""
             media = [shape.id() for shape in scene.shapes() if shape.is_medium_transition()]
             return f'with "lit", the participating medium of "{media[0]}" is not rendered' if media else ""
@@ -659,9 +649,7 @@ def integrator() -> type:
 
 def open_model(props: mi.Properties):
     """Return the model that the properties ``filename`` and ``storage`` name."""
-    path, storage = properties.filename(props), properties.one_of(props, "storage", ("uint8", "float32"))
-    if not path:
-        raise RuntimeError('parameter "filename": not given, a file of "mi-diffind fit field" is needed')
+    path, storage = tables.file_and_storage(props, "field")
     from mi_diffind.tasks.radiance import TASK
 
     return TASK.open(mi.TensorXf, path, storage=storage if storage == "float32" else "")

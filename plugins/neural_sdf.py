@@ -3,14 +3,12 @@
 from __future__ import annotations  # Delayed parsing of type annotations
 
 import math
-import threading
 import time
-from pathlib import Path
-from weakref import WeakValueDictionary
 
 import mitsuba as mi
 import numpy as np
 
+from mi_diffind.core.errors import raised_as
 from mi_diffind.core.files import stamp
 from mi_diffind.tasks.sdf import TASK, grids, marching
 
@@ -30,10 +28,7 @@ from .support.distance_shapes import (
 from .support.manual import shared_parts
 from .support.placement import Placement, similarity
 from .support.properties import Kept, StockNode
-
-#: Models whose arrays cannot be optimised, shared by all shapes of a file.
-_shared: WeakValueDictionary = WeakValueDictionary()
-_lock = threading.RLock()  # Mitsuba loads shapes in parallel; a thread that waits for a kernel may load another shape
+from .support.tables import file_and_storage, shared
 
 #: Cells along the longest side of the finest grid that is chosen automatically.
 FINEST = 512
@@ -46,16 +41,11 @@ TYPICAL_ERROR = 0.005
 
 
 def open_model(props: mi.Properties):
-    """Return the model that the properties ``filename`` and ``storage`` name."""
-    path, storage = properties.filename(props), properties.one_of(props, "storage", ("uint8", "float32"))
-    if not path:
-        raise RuntimeError('parameter "filename": not given, a file of "mi-diffind fit sdf" is needed')
+    """Return the model that the properties ``filename`` and ``storage`` name; all shapes of a file share bytes."""
+    path, storage = file_and_storage(props, TASK.name)
     if storage == "float32":
         return TASK.open(mi.TensorXf, path, storage=storage)
-    key = (path, stamp(Path(path)), mi.TensorXf)
-    with _lock:
-        model = _shared.get(key)
-        return model if model is not None else _shared.setdefault(key, TASK.open(mi.TensorXf, path))
+    return shared((TASK.name, path, *stamp(path), mi.TensorXf), lambda: TASK.open(mi.TensorXf, path))
 
 
 def decode_grid(model, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict]:
@@ -249,10 +239,8 @@ def factory(props: mi.Properties):
     to_world = props.get("to_world", mi.ScalarTransform4f())
     similarity(to_world)  # raises for an invalid transform
     normals = properties.one_of(props, "normals", ("smooth", "analytic"))
-    try:
+    with raised_as(RuntimeError, RuntimeError, at=model.table.path):
         values, lower, upper, report = decode_grid(model, resolution)
-    except RuntimeError as e:
-        raise RuntimeError(f"{model.table.path}: {e}") from None
     to_unit = mi.ScalarTransform4f().translate(list(model.centre)).scale(model.scale)
     to_world = mi.ScalarTransform4f(np.array(to_world.matrix))
     shape, kept = native_grid(props, values, lower, upper, to_world @ to_unit, normals)
@@ -291,10 +279,8 @@ def _from_mesh(node: StockNode) -> str:
     if textures := materials + node.nested_types(mi.ObjectType.Texture):
         raise Kept(f"has a material with textures ({', '.join(textures)}), distance fields have no texture coordinates")
     node.allow("filename", "shape_index", "face_normals", "flip_normals", "flip_tex_coords", "to_world", "bsdf")
-    try:
+    with raised_as(Kept, RuntimeError, at="cannot be placed"):
         similarity(props.get("to_world", mi.ScalarTransform4f()))
-    except RuntimeError as e:
-        raise Kept(f"cannot be placed: {e}") from None
     source = closed_mesh_file(node.file(), node.folder, props.get("shape_index", 0))
     smooth = check_normals(props, source)
     table = node.fit(TASK.name, source, bytes=BYTES)
@@ -303,9 +289,7 @@ def _from_mesh(node: StockNode) -> str:
         limits = f"{LEAST_IOU:g} and {LARGEST_ANGLE:g}° are needed"
         raise Kept(f"{node.file().name} would have {quality}, {limits}: fit it by hand, with more bytes")
     props["filename"] = str(table.path)
-    for name in ("shape_index", "face_normals", "flip_normals", "flip_tex_coords"):
-        if name in props:
-            del props[name]
+    properties.remove(props, "shape_index", "face_normals", "flip_normals", "flip_tex_coords")
     lost = f", those of smooth shading, {smooth:.1f}° from the triangles, are lost" if smooth >= 0.05 else ""
     return f"{table.path.name}, {quality}{lost}"
 

@@ -10,7 +10,7 @@ import mitsuba as mi
 from mi_diffind.core import compat
 
 from . import Plugin
-from .support import footprint, omissions
+from .support import footprint, omissions, properties
 from .support.footprint import Differentials
 from .support.manual import shared_parts
 
@@ -178,9 +178,7 @@ def integrator() -> type:
             super().__init__(props)
             if "max_depth" not in props:
                 self.max_depth = INFINITE
-            self.jitter = props.get("jitter", True)
-            if not isinstance(self.jitter, bool):
-                raise RuntimeError(f'parameter "jitter": found {self.jitter}, allowed are true and false')
+            self.jitter = properties.flag(props, "jitter", True)
 
         def to_string(self) -> str:
             depth = -1 if self.max_depth == INFINITE else self.max_depth

@@ -131,11 +131,11 @@ def test_short_and_quiet_jobs_write_no_line(clock, log, shown):
 
 #: What asks for too much of a machine of 16 GiB, and the sentence.
 TOO_MUCH = [
-    (lambda: started("sdf", bytes="100G"), "--bytes: found 107,374,182,400 bytes, a table file holds"),
-    (lambda: started("sdf", bytes="512M"), "--bytes: found 536,870,912, which takes about 32 GiB"),
+    (lambda: started("sdf", bytes=100 * 2**30), "--bytes: found 107,374,182,400 bytes, a table file holds"),
+    (lambda: started("sdf", bytes=2**29), "--bytes: found 536,870,912, which takes about 32 GiB"),
     (lambda: started("field", resolution=100_000), "--resolution: found 100,000, which takes about 22,351,742"),
-    (lambda: started("field", bytes="100G"), "--bytes: found 107,374,182,400 bytes"),
-    (lambda: requested_bytes({"compression": None, "bpp": None, "bytes": "100G"}, IMAGE),
+    (lambda: started("field", bytes=100 * 2**30), "--bytes: found 107,374,182,400 bytes"),
+    (lambda: requested_bytes({"compression": None, "bpp": None, "bytes": 100 * 2**30}, IMAGE),
      "--bytes: found 107,374,182,400 bytes, a table file holds at most 1,073,741,824"),
     (lambda: CaptureSettings(resolution=100_000), "resolution: found 100,000, which takes about"),
     (lambda: CaptureSettings(views=10**9), "views: found 1,000,000,"),

@@ -2,12 +2,13 @@
 
 import itertools
 import math
+from types import SimpleNamespace
 
 import pytest
 
 from mi_diffind.core import units
 from mi_diffind.core.errors import UsageError
-from mi_diffind.core.units import parse_size
+from mi_diffind.maps.model import requested_bytes
 from mi_diffind.tasks.image import arrays
 from mi_diffind.tasks.image.arrays import ImageBudget, fit_bytes, search
 
@@ -139,16 +140,18 @@ def test_bytes_out_of_range(text):
 
 
 def test_a_size_is_asked_for_in_one_way():
-    assert parse_size(3 * 1024**2, 1024**2, compression="12x") == 262144
-    assert parse_size(3 * 1024**2, 1024**2, nbytes="256k") == 262144
-    assert parse_size(3 * 1024**2, 1024**2, bpp="2") == 262144
-    assert parse_size(3, 1, compression=1000) == 1
-    with pytest.raises(ValueError, match="found nothing, give exactly one"):
-        parse_size(3, 1)
-    with pytest.raises(ValueError, match="found compression, bpp, give exactly one"):
-        parse_size(3, 1, compression=12, bpp=2)
-    with pytest.raises(ValueError, match="out of range"):
-        parse_size(3, 1, compression="1e-320")
+    def size(nbytes=3 * 1024**2, texels=1024**2, **given):
+        options = dict.fromkeys(("compression", "bytes", "bpp")) | given
+        return requested_bytes(options, SimpleNamespace(nbytes=nbytes, texels=texels))
+
+    assert size() == size(compression=12.0) == size(bytes=262144) == size(bpp=2.0) == 262144
+    assert size(3, 1, compression=1000.0) == 1
+    with pytest.raises(UsageError, match="found compression, bpp, give exactly one"):
+        size(compression=12.0, bpp=2.0)
+    with pytest.raises(UsageError, match="out of range"):
+        size(compression=1e-320)
+    with pytest.raises(UsageError, match="bpp 1e308 is out of range"):
+        size(bpp=1e308)
 
 
 def test_more_than_fits_is_refused(monkeypatch):

@@ -1,7 +1,5 @@
 """Intersection of rays with an axis-aligned box (the slab method of Kay and Kajiya 1986)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import drjit as dr

@@ -8,8 +8,6 @@ largest size that fits::
     side = budget.largest(lambda n: [((n, n, 4), 8), ((8, 8, 8, 8, 3), 8)], range(1, 4096))
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence

@@ -15,8 +15,6 @@ Conventions, the same everywhere in this package:
 Everything works on any JIT backend of Dr.Jit; nothing here knows Mitsuba.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
@@ -110,20 +108,14 @@ def _corners(axes, resolution):
     """
     result = [(None, None)]
     for (lower, upper, w), n in zip(axes, resolution, strict=True):
-        ends = [(lower, 1 - w), (upper, w)]
-        if _is_zero(w):
-            ends = [(lower, 1 - w)]
-        grown = []
+        ends, grown = [(lower, 1 - w), (upper, w)], []
+        if w.state == dr.VarState.Literal and not dr.grad_enabled(w) and w[0] == 0:
+            ends.pop()
         for index, weight in result:
             for i, v in ends:
                 grown.append((i if index is None else dr.fma(index, n, i), v if weight is None else weight * v))
         result = grown
     return result
-
-
-def _is_zero(weight) -> bool:
-    """Return whether a weight is the constant zero in the code, without evaluating anything."""
-    return weight.state == dr.VarState.Literal and not dr.grad_enabled(weight) and weight[0] == 0
 
 
 def weighted_sum(terms):

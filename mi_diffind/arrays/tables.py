@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.archives import Allowance, Archive, ArchiveError, LimitError
-from ..core.errors import DiffindError, printable, reason
+from ..core.errors import DiffindError, printable, raised_as, reason
 from ..core.files import irregular, replacing, shown
 from .indirection import DifferentiableArray, check_storage
 from .lookup import BORDERS, STORAGES, gathers, pack_bits, pair_words, quantize, unpack_bits
@@ -344,10 +344,8 @@ def check_allowance(table: Table, nbytes: int, content: str) -> None:
     if table.path is None:
         return
     stored = sum(array.entries.nbytes for array in table.arrays.values())
-    try:
+    with raised_as(TableError, LimitError):
         Allowance(table.path).check(stored + nbytes, content)
-    except LimitError as e:
-        raise TableError(str(e)) from None
 
 
 def byte_array(values: np.ndarray, scale: float = 1.0, offset: float = 0.0) -> StoredArray:

@@ -1,7 +1,5 @@
 """``mi-diffind capture``: views of a scene or of 3D Gaussians from all sides with their poses, for a radiance field."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from ..core.arguments import WORKER_ARGUMENTS, add_arguments

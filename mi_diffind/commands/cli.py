@@ -3,8 +3,6 @@
 Exit codes: 0 done, 1 a check failed, 2 bad usage or bad input, 130 interrupted.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import os

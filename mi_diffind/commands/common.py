@@ -1,7 +1,5 @@
 """Options that several verbs have, and checks before the work starts."""
 
-from __future__ import annotations
-
 import argparse
 
 from ..core import runtime

@@ -1,7 +1,5 @@
 """``mi-diffind compare``: a scene as written beside the same scene with other plugins, by default exact ones."""
 
-from __future__ import annotations
-
 from ..core.files import check_scene_file, writable_folder
 from .common import learn_option, positive, say, scene_options, set_variant, verb
 

@@ -1,7 +1,5 @@
 """``mi-diffind convert``: a scene with learned plugins in place of Mitsuba's."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from ..core.files import check_scene_file

@@ -1,7 +1,5 @@
 """``mi-diffind decode``: the content of a table file in an ordinary format."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from ..core.arguments import add_arguments

@@ -1,7 +1,5 @@
 """``mi-diffind examples``: the example scenes, for an installation without a checkout."""
 
-from __future__ import annotations
-
 from .common import say, verb
 
 HELP = "copy the example scenes, and what they read, to a folder"

@@ -1,7 +1,5 @@
 """``mi-diffind fetch``: data of the pages that do not ship, from where their makers publish them."""
 
-from __future__ import annotations
-
 from ..scenes.examples import DOWNLOADS
 from .common import say, verb
 

@@ -1,7 +1,5 @@
 """``mi-diffind fit``: train the tables of a task."""
 
-from __future__ import annotations
-
 from ..core.arguments import add_arguments, natural, positive
 from ..core.files import writable_file, writable_folder
 from ..core.progress import Deadline

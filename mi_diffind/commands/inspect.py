@@ -1,7 +1,5 @@
 """``mi-diffind inspect``: the content of a table file, or the plugins of this package in a scene."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from ..core.files import check_scene_file

@@ -1,7 +1,5 @@
 """``mi-diffind regress``: a check that scenes still render like their stored references."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from ..core.errors import UsageError

@@ -1,7 +1,5 @@
 """``mi-diffind render``: an image or an orbit of a scene that names learned plugins."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``mi-diffind tradeoff``: time against accuracy of the contenders of a task."""
 
-from __future__ import annotations
-
 from ..studies import run as run_study
 from ..studies import studies
 from .common import alternative, alternatives, say, set_variant, variant_option, verb

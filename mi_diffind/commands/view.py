@@ -1,7 +1,5 @@
 """``mi-diffind view``: a scene or a table file in a browser, with learned plugins beside exact ones."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

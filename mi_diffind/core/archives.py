@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from . import units
-from .errors import DiffindError, UsageError, reason
+from .errors import DiffindError, UsageError, raised_as, reason
 
 #: Methods of compression that are read. Members in bz2 or lzma, which NumPy never writes, grow faster than deflate.
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -158,10 +158,8 @@ def allowed(file_bytes: int) -> int:
     """
     limit, given = FREE + FACTOR * file_bytes, os.environ.get(VARIABLE, "")
     if given:
-        try:
+        with raised_as(UsageError, ValueError, at=f"environment variable {VARIABLE}"):
             limit = max(limit, units.parse_bytes(given))
-        except ValueError as e:
-            raise UsageError(f"environment variable {VARIABLE}: {e}") from None
     return min(limit, units.memory())
 
 

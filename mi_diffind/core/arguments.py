@@ -1,12 +1,10 @@
 """Command-line arguments that tasks and studies declare, and parsers of their values."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Mapping
 
-from .errors import UsageError
+from .errors import UsageError, raised_as
 from .files import check_distinct
 
 #: Largest size or count: Dr.Jit and Mitsuba hold them in 32 bits.
@@ -49,10 +47,8 @@ class Argument:
         parse, plain = self.options.get("type"), isinstance(value, (str, int, float)) and not isinstance(value, bool)
         if parse is None or not plain or value in (self.default, math.inf):
             return value
-        try:
+        with raised_as(UsageError, argparse.ArgumentTypeError, ValueError, at=self.name):
             return parse(str(value))
-        except (argparse.ArgumentTypeError, ValueError) as e:
-            raise UsageError(f"{self.name}: {e}") from None
 
 
 def add_arguments(parser: argparse.ArgumentParser, arguments: tuple[Argument, ...]) -> None:
@@ -136,17 +132,11 @@ def define(text: str) -> tuple[str, str]:
 
 
 def checked(parse):
-    """Make a type of ``argparse`` from a parser that raises ``ValueError``, so that its message is shown.
-
-    The type returns the text itself.
-    """
+    """Make a type of ``argparse`` from a parser that raises ``ValueError``, so that its message is shown."""
 
     def parsed(text: str):
-        try:
-            parse(text)
-        except ValueError as e:
-            raise argparse.ArgumentTypeError(str(e)) from None
-        return text
+        with raised_as(argparse.ArgumentTypeError, ValueError):
+            return parse(text)
 
     return parsed
 

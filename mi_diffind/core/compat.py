@@ -4,8 +4,6 @@ Each has a test, in ``tests/test_compat.py`` or of its callers. Mitsuba and Dr.J
 function is called, so that this module may be imported before LLVM is chosen (:mod:`.runtime`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import importlib

@@ -8,8 +8,6 @@ A part that ships is found by its place, a module of a package (``mi_diffind.tas
     profile = "their_package.profile"
 """
 
-from __future__ import annotations
-
 import importlib
 import importlib.metadata
 import pkgutil

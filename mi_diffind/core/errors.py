@@ -1,7 +1,6 @@
 """Base class of all errors that a user can cause, and text from files in a form that a terminal may show."""
 
-from __future__ import annotations
-
+import contextlib
 import unicodedata
 
 #: Most characters of a message.
@@ -61,6 +60,15 @@ class DiffindError(Exception):
 
 class UsageError(DiffindError):
     """Bad input that the argument parser cannot detect."""
+
+
+@contextlib.contextmanager
+def raised_as(kind: type[Exception], *caught: type[Exception], at: object = ""):
+    """Raise the ``caught`` errors as one of another ``kind``, in the same words, after the place ``at``."""
+    try:
+        yield
+    except caught as e:
+        raise kind(f"{at}: {e}" if at else str(e)) from None
 
 
 def reason(error: BaseException, **names: str) -> str:

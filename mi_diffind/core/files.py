@@ -1,7 +1,5 @@
 """Checks of files to read, and writing of files such that no half-written file stays behind."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hashlib

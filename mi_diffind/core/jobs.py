@@ -4,8 +4,6 @@ A job is a function of one argument. Function, argument and result travel betwee
 module, the other two can be pickled. Importing this imports neither Dr.Jit nor Mitsuba.
 """
 
-from __future__ import annotations
-
 import collections
 import concurrent.futures
 import contextlib

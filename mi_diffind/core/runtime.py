@@ -12,8 +12,6 @@ run and no scene object exists. If no usable library exists, the LLVM backend is
 ``mi.set_variant("llvm_…")`` raises instead of aborting later; CUDA variants are not concerned.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import functools
@@ -29,7 +27,7 @@ from pathlib import Path
 
 from . import compat, threads
 from .compat import dr, mi
-from .errors import UsageError
+from .errors import UsageError, raised_as
 from .progress import interruptible
 
 ENV = "DRJIT_LIBLLVM_PATH"
@@ -280,11 +278,10 @@ def use_variant(name: str | None = None) -> str:
         raise UsageError(llvm_problem())
     if name.startswith("cuda"):
         _require_gpu(name)
-    with interruptible() as stop:  # the native import loses a KeyboardInterrupt
-        try:
-            mi.set_variant(name)
-        except ImportError as e:
-            raise UsageError(f'the variant "{name}" cannot run here: {e}') from None
+    problem = f'the variant "{name}" cannot run here'
+    # The native import loses a KeyboardInterrupt
+    with interruptible() as stop, raised_as(UsageError, ImportError, at=problem):
+        mi.set_variant(name)
     if stop.is_set():
         raise KeyboardInterrupt
     return name

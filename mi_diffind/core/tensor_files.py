@@ -1,7 +1,5 @@
 """Tensor files of measured materials, as Mitsuba's plugins ``measured`` and ``measured_polarized`` read them."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import struct

@@ -4,8 +4,6 @@ In Mitsuba 3.9, two threads that render plugins written in Python end the proces
 a thread that drops a scene while another one renders. Importing this imports neither Dr.Jit nor Mitsuba.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import functools

@@ -1,7 +1,5 @@
 """Sizes as users write them (bytes, compression ratios, bits per texel), and figures as people read them."""
 
-from __future__ import annotations
-
 import math
 import os
 import re
@@ -76,29 +74,6 @@ def check_size(name: str, value: float, most: float) -> None:
     """Refuse a number of bytes above ``most``, as of a table file. Raises :class:`.UsageError`."""
     if value > most:
         raise UsageError(f"{name}: found {value:,} bytes, a table file holds at most {most:,}")
-
-
-def parse_size(
-    uncompressed_bytes: int,
-    texels: int,
-    compression: str | float | None = None,
-    nbytes: str | float | None = None,
-    bpp: str | float | None = None,
-) -> int:
-    """Return a size in bytes (at least 1) from exactly one of a compression ratio, bytes and bits per texel.
-
-    ``compression`` divides ``uncompressed_bytes``, ``bpp`` counts bits for each of ``texels``. Raises ``ValueError``.
-    """
-    given = {"compression": compression, "bytes": nbytes, "bpp": bpp}
-    given = {name: value for name, value in given.items() if value is not None}
-    if len(given) != 1:
-        raise ValueError(f"size: found {', '.join(given) or 'nothing'}, give exactly one of compression, bytes and bpp")
-    if nbytes is not None:
-        return parse_bytes(nbytes)
-    wanted = parse_bpp(bpp) * texels / 8 if bpp is not None else uncompressed_bytes / parse_compression(compression)
-    if not math.isfinite(wanted):
-        raise ValueError(f"size: {next(iter(given))} {next(iter(given.values()))} is out of range")
-    return max(1, round(wanted))
 
 
 def _positive(text, ending: str, quantity: str, example: str) -> tuple[float, re.Match]:

@@ -295,7 +295,7 @@ def fit(
         if record.best is None or value >= top - problem.tolerance:
             record.best = trainer.snapshot(all_moments=False).parameters
             record.best_measured, record.best_step = measured, trainer.step
-        bar.show_figure(name, value)
+        bar.show_figure(name, f"{value:.2f}", refresh=True)
 
     with interruptible() as stop, cores(settings.deterministic), compat.room_for_sums(LARGEST_SUMS), bar.shown:
         while trainer.share < 1 and not stop.is_set():
@@ -337,7 +337,7 @@ def fit(
             record.references[trainer.phase] = value if reference is None else 0.5 * (reference + value)
             if settings.schedule == "plateau":
                 record.plateau = _plateau_after(*record.plateau, trainer.step, value, settings)
-            bar.show_loss(value)
+            bar.show_figure("loss", f"{value:.3g}")
             good = before  # not the state after this step: nobody has seen its loss yet
             if measured or last:
                 measure(value)
@@ -418,13 +418,9 @@ class _Bar:
             self.shown.bar_format = self.title + self._form(trainer.step, trainer.share)
         self.shown.update((trainer.step if self.seconds is None else trainer.share) - self.shown.n)
 
-    def show_loss(self, loss: float) -> None:
-        self.text["loss"] = f"{loss:.3g}"
-        self.shown.set_postfix(self.text, refresh=False)
-
-    def show_figure(self, name: str, value: float) -> None:
-        self.text[name] = f"{value:.2f}"
-        self.shown.set_postfix(self.text, refresh=not self.lines)
+    def show_figure(self, name: str, value: str, refresh: bool = False) -> None:
+        self.text[name] = value
+        self.shown.set_postfix(self.text, refresh=refresh and not self.lines)
 
 
 def _plateau_after(factor: float, best: float | None, since: int, step: int, loss: float, settings) -> list:
@@ -531,12 +527,6 @@ def _checkpoint_meta(path) -> dict:
             return meta if "lr_scale" in meta else {}
     except Exception:  # zipfile, json and numpy each have their own for another kind of file
         return {}
-
-
-def checkpoint_settings(path) -> dict:
-    """Return the settings of the training and the identity of the problem in a checkpoint; {} if it holds none."""
-    settings = _checkpoint_meta(path).get("settings")
-    return settings if isinstance(settings, dict) else {}
 
 
 def _check_meta(meta: dict) -> None:

@@ -115,15 +115,6 @@ class FitSettings:
         return {name: value for name, value in asdict(self).items() if name not in self.common}
 
 
-def within_memory(settings: FitSettings) -> FitSettings:
-    """Return the settings. Raises :class:`.UsageError` if their batch exceeds this machine's memory.
-
-    Dr.Jit ends the process where memory cannot be allocated.
-    """
-    check_memory("batch", settings.batch, SAMPLE_BYTES * settings.batch)
-    return settings
-
-
 @dataclass
 class FitResult:
     """Record of a training: the best state and the history.
@@ -257,7 +248,7 @@ class FitRequest:
         least: int = 1,
     ) -> FitResult:
         """Train one :class:`.loop.Problem` with these settings. Other parameters are those of :class:`Stage`."""
-        if self.deadline is not None and finish is not None:
+        if finish is not None and self.deadline is not None:
             self.deadline.rehearse(finish, times)
         return problem.train(
             self.settings, self.checkpoint, self.resume, self.progress, title=title, deadline=self.deadline, least=least
@@ -357,6 +348,11 @@ class Fitted:
         from html import escape
 
         return f"<pre>{escape(repr(self))}</pre>"
+
+
+def significant(figures: Mapping[str, float]) -> dict[str, float]:
+    """Return figures with five digits, as a table file holds them."""
+    return {name: float(f"{value:.5g}") for name, value in figures.items()}
 
 
 def table_path(path: str | os.PathLike) -> Path:
@@ -534,7 +530,7 @@ class Task:
         result = request.train(problem, finish=stored)
         table, measured = stored()
         table.settings = {**request.recorded(result), **table.settings}
-        table.measured = {k: float(f"{v:.5g}") for k, v in measured.items()}
+        table.measured = significant(measured)
         return Fitted(table, result)
 
     def load(self, path: str | os.PathLike) -> Table:
@@ -725,7 +721,9 @@ def fit(
             allowed = ", ".join(sorted({*options, *names}))
             raise UsageError(f'{task}: found the argument "{key}", allowed are {allowed}')
         options |= {key: arguments[key].parsed(value)} if key in options else {}
-    settings = within_memory(chosen.settings(preset, {k: v for k, v in given.items() if k in names}, options))
+    settings = chosen.settings(preset, {k: v for k, v in given.items() if k in names}, options)
+    # Dr.Jit ends the process where memory cannot be allocated
+    check_memory("batch", settings.batch, SAMPLE_BYTES * settings.batch)
     output = None if output is None else chosen.output_path(output)
     check_files(chosen.arguments, options, {"-o": output, "--checkpoint": checkpoint})
     if resume and deadline is not None:

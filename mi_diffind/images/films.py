@@ -1,7 +1,5 @@
 """Films: frames as H.264, WebP or GIF."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import subprocess

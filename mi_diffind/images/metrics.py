@@ -1,7 +1,5 @@
 """Errors of images: thin layers over NumPy and NVIDIA's FLIP. Images are linear, shape ``(height, width, 3)``."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -13,7 +13,7 @@ from typing import BinaryIO
 import numpy as np
 
 from ..core.archives import Allowance, LimitError
-from ..core.errors import DiffindError, reason
+from ..core.errors import DiffindError, raised_as, reason
 from ..core.files import irregular, shown
 from ..core.threads import threads_for_files
 from ..core.units import memory
@@ -106,10 +106,8 @@ def read_picture(path: str | os.PathLike) -> Picture:
     path = Path(path)
     if fault := _fault(read_file(path, memory() // 4)):
         raise PictureError(f"{path}: is {fault}")
-    try:
+    with raised_as(PictureError, LimitError):
         _check_size(path)
-    except LimitError as e:
-        raise PictureError(str(e)) from None
     # A TGA file has no signature
     file_format = mi.Bitmap.FileFormat.TGA if path.suffix.lower() == ".tga" else mi.Bitmap.FileFormat.Auto
     try:

@@ -3,8 +3,6 @@
 Importing this module imports no Dr.Jit: an array that is not NumPy's brings its own.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 #: Coefficients of a polynomial for ((x + 0.055) / 1.055)^2.4 from 0.04045 to 1, within 3e-6 and 0.005%.

@@ -1,7 +1,5 @@
 """Arguments of tasks that store maps."""
 
-from __future__ import annotations
-
 from ..core import units
 from ..core.arguments import Argument, checked, decibels, positive
 from .source import NONFINITE

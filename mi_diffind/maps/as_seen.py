@@ -6,8 +6,6 @@ random numbers, so that maps without errors give a difference of 0. Each picture
 random numbers: the mean product of both differences is the squared error without the noise of the renders.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from types import ModuleType

@@ -1,7 +1,5 @@
 """Entries of a material: which image, which channels of it and which factor make up each map."""
 
-from __future__ import annotations
-
 import math
 import os
 import tempfile
@@ -10,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.errors import DiffindError
+from ..core.errors import DiffindError, raised_as
 from ..core.files import OutsideError, path_by_name
 from ..images.reader import Picture, PictureError, read_picture
 
@@ -105,19 +103,15 @@ class ImageFiles:
 
     def find(self, folder: Path, name: str, file: Path) -> str:
         """Return the path of the image ``name`` of a ``file``. Raises :class:`SourceError`."""
-        try:
+        with raised_as(SourceError, OutsideError):
             return str(path_by_name(folder, name, file, self.outside))
-        except OutsideError as e:
-            raise SourceError(str(e)) from None
 
     def read(self, file: str) -> Picture:
         """Return an image. Raises :class:`SourceError`."""
         if file not in self._pictures:
-            try:
+            with raised_as(SourceError, PictureError):
                 self._pictures[file] = read_picture(file)
                 self.nbytes += os.stat(file).st_size
-            except PictureError as e:
-                raise SourceError(str(e)) from None
         return self._pictures[file]
 
     def decode(self, name: str, data: bytes) -> str:

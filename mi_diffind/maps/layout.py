@@ -138,7 +138,10 @@ class Layout:
                     same = [len(stored)]
                     stored.append(values)
                     averaged.append(averaging)
-                    initial.append(_initial(m.role, c))
+                    # Initial values of the cascaded array (supplement 1.3): grey, white, light blue, grey; others 0
+                    direction = 1.0 if c == 2 else 0.5
+                    grey = {"albedo": 0.5, "ao": 1.0, "roughness": 0.5, "normal": direction}
+                    initial.append(grey.get(m.role, 0.0))
                     groups.append(m.name)
                 where.append(same[0])
             maps.append(replace(shell, where=tuple(where)))
@@ -299,13 +302,6 @@ def _drops_z(m: Map, where: list, wanted: bool | None) -> bool:
     x, y = 2 * m.values[..., 0] - 1, 2 * m.values[..., 1] - 1
     z = 0.5 + 0.5 * np.sqrt(np.maximum(1 - x * x - y * y, 0))
     return float(np.mean((z - m.values[..., 2]) ** 2)) <= 10 ** (-NORMAL_FLOOR_DB / 10)
-
-
-def _initial(role: str, channel: int) -> float:
-    """Return the initial value of the cascaded array (supplement 1.3): grey, white, light blue, grey; others 0."""
-    if role == "normal":
-        return 1.0 if channel == 2 else 0.5
-    return {"albedo": 0.5, "ao": 1.0, "roughness": 0.5}.get(role, 0.0)
 
 
 #: Largest difference across a border that repeats, as a multiple of the differences between neighbours inside.

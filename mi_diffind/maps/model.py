@@ -1,7 +1,6 @@
 """Table files of maps: their arrays, their pages, and the maps as a model that is measured and decoded."""
 
-from __future__ import annotations
-
+import math
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -14,11 +13,11 @@ from ..arrays.indirection import DifferentiableArray
 from ..arrays.pages import SIDE_BITS, page_counts, page_shift
 from ..arrays.tables import MAX_BYTES, PAGES, Table, TableError, allocate_pages, page_sides
 from ..core import units
-from ..core.errors import UsageError, printable
+from ..core.errors import UsageError, printable, raised_as
 from ..core.files import replacing
 from ..core.threads import threads_for_files
 from ..fitting.loop import FitResult, Problem
-from ..fitting.task import FitRequest, Fitted, Model
+from ..fitting.task import FitRequest, Fitted, Model, significant
 from ..images import srgb
 from . import as_seen
 from .entries import describe_transform
@@ -80,10 +79,8 @@ def _page_entries(table: Table, name: str, size: tuple[int, int]) -> int:
     """Return the number of entries of the pages of an array, on an image of ``size``. Raises :class:`TableError`."""
     pages, counts, largest = table.arrays[name + PAGES], page_counts(size), 2 ** SIDE_BITS[1]
     where = f'{table.path}: array "{name}{PAGES}"'
-    try:
+    with raised_as(TableError, ValueError, at=where):
         sides = page_sides(pages)
-    except ValueError as e:
-        raise TableError(f"{where}: {e}") from None
     if sides.shape != (*counts, 2):
         raise TableError(f"{where} has the shape {sides.shape}, expected {(*counts, 2)}")
     if sides.max() > largest:
@@ -93,16 +90,17 @@ def _page_entries(table: Table, name: str, size: tuple[int, int]) -> int:
 
 def requested_bytes(options, source: Source) -> int:
     """Return the bytes of the options :data:`SIZES`, by default a twelfth of the source's. Raises UsageError."""
-    given = {k: options[k] for k in ("compression", "bpp")} | {"nbytes": options["bytes"]}
-    if not any(given.values()):
-        given["compression"] = 12
-    try:
-        wanted = units.parse_size(source.nbytes, source.texels, **given)
-    except ValueError as e:
-        raise UsageError(str(e)) from None
-    if options["bytes"] is not None:
-        units.check_size("--bytes", wanted, MAX_BYTES)
-    return wanted
+    given = {name: options[name] for name in ("compression", "bytes", "bpp") if options[name] is not None}
+    if len(given) > 1:
+        raise UsageError(f"size: found {', '.join(given)}, give exactly one of compression, bytes and bpp")
+    if "bytes" in given:
+        units.check_size("--bytes", given["bytes"], MAX_BYTES)
+        return given["bytes"]
+    wanted = given["bpp"] * source.texels / 8 if "bpp" in given else source.nbytes / given.get("compression", 12)
+    if not math.isfinite(wanted):
+        name, value = next(iter(given.items()))
+        raise UsageError(f"size: {name} {value} is out of range".replace("e+", "e"))
+    return max(1, round(wanted))
 
 
 def requested_border(options) -> tuple[str, str] | None:
@@ -243,11 +241,6 @@ def complete(
     fitted.lines += [*lines, *source.notes]
     fitted.figures = {**figures, "origins": list(source.origins), **fitted.figures}
     return fitted
-
-
-def significant(figures: Mapping[str, float]) -> dict[str, float]:
-    """Return figures with five digits, as a table file holds them."""
-    return {name: float(f"{value:.5g}") for name, value in figures.items()}
 
 
 class MapsModel(Model):

@@ -1,7 +1,5 @@
 """Names of maps, and of folders of their images, as programs and libraries of textures write them."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import os

@@ -1,7 +1,5 @@
 """Search for the smallest file of a wanted quality, by a few short trainings and one or more of full length."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 
@@ -54,7 +52,6 @@ def search_by_psnr(
     settings: FitSettings,
     size_of: Callable[[float], object],
     train: Callable[[object, int, FitRequest, str], tuple[Table, FitResult]],
-    most: int = TRAININGS,
 ) -> tuple[Table, FitResult, list[dict]]:
     """Search the smallest file whose ``psnr_db`` is at least ``goal``.
 
@@ -63,14 +60,15 @@ def search_by_psnr(
 
     Sizes follow the secant of quality over the logarithm of bytes. Short trainings find where the quality is near;
     trainings of full length, of ``settings.steps`` steps, end within :data:`EXCESS_DB` of the goal, or where a
-    sufficient size is within :data:`NEAR` of an insufficient one, or after ``most``. No size is larger than the source.
+    sufficient size is within :data:`NEAR` of an insufficient one, or after :data:`TRAININGS`. No size
+    is larger than the source.
 
     Returns the table, the record of its training, and all trainings (``bytes``, ``steps``, ``psnr_db``). After Ctrl-C
     the record is marked ``interrupted``. Raises :class:`FittingError`, or after Ctrl-C ``KeyboardInterrupt``, if no
     training has reached the goal.
     """
     tried, best, interrupted = [], None, False
-    most = most if request.deadline is None else min(most, LIMITED_TRAININGS)
+    most = TRAININGS if request.deadline is None else LIMITED_TRAININGS
     lengths = [max(1, round(SHORT * settings.steps))] * SHORT_TRAININGS + [settings.steps] * most
     nbytes = middle = source.nbytes / 12
     gain, rest = GAIN_DB, [*lengths]
@@ -92,8 +90,9 @@ def search_by_psnr(
         tried.append({"bytes": size.nbytes, "steps": steps, "psnr_db": psnr})
         if psnr >= goal and (best is None or table.nbytes < best[0].nbytes):
             best = table, result
-        points = sorted((t["bytes"], t["psnr_db"]) for t in tried if t["steps"] == steps)
-        below, above = (_nearest(points, wanted, sufficient) for sufficient in (False, True))
+        points = [(t["bytes"], t["psnr_db"]) for t in tried if t["steps"] == steps]
+        below = max((p for p in points if p[1] < wanted), default=None)
+        above = min((p for p in points if p[1] >= wanted), default=None)
         largest = getattr(size, "full", False) or size.nbytes >= 0.99 * source.nbytes
         ended = bool(below and above and above[0] <= NEAR * below[0]) or (psnr < wanted and largest)
         if steps == settings.steps:
@@ -117,12 +116,6 @@ def search_by_psnr(
 def search_lines(tried: list[dict]) -> list[str]:
     """Return the trainings of :func:`search_by_psnr` as lines of text."""
     return [f"tried {t['bytes']:,} bytes in {t['steps']} steps: {t['psnr_db']:.2f} dB" for t in tried]
-
-
-def _nearest(points: list[tuple], wanted: float, sufficient: bool) -> tuple | None:
-    """Return the smallest of the ``points`` (bytes, dB) that reach a quality, or the largest that does not."""
-    side = [point for point in points if (point[1] >= wanted) == sufficient]
-    return (side[0] if sufficient else side[-1]) if side else None
 
 
 def _octave_db(tried: list[dict]) -> float:

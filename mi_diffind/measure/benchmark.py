@@ -154,7 +154,7 @@ class Benchmark:
                 in_kernel = count_query(function)
                 operations.setdefault(query, {})[name] = (known(query) if known else in_kernel).asdict()
                 return 0.0
-            return timed(lambda: total(function())[0]).seconds
+            return timed(lambda: total(function())[0])
 
         self._time(case, case.name, list(functions), self.settings.rounds, seconds)
 
@@ -163,7 +163,7 @@ class Benchmark:
         names = {c.name for c in self.plan.candidates}
         passes = {name: function for name, function in case.passes().items() if name in names}
         keys, title = [(PASS, name) for name in passes], f"{case.name}, {PASS}"
-        self._time(case, title, keys, self.settings.passes, lambda _, name, i: timed(lambda: passes[name](i)).seconds)
+        self._time(case, title, keys, self.settings.passes, lambda _, name, i: timed(lambda: passes[name](i)))
 
     def _time(
         self, case: Case, title: str, keys: list[tuple[str, str]], rounds: int,

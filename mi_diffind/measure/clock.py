@@ -29,24 +29,14 @@ from ..core import compat
 Query = Callable[[], object]
 
 
-@dataclass(frozen=True)
-class Timed:
-    """Evaluated ``value`` of a function and ``seconds`` of its kernels."""
-
-    value: object
-    seconds: float
-
-
-def timed(function: Query) -> Timed:
-    """Call ``function()``, evaluate its result and measure the time."""
+def timed(function: Query) -> float:
+    """Call ``function()``, evaluate its result, and return the seconds of the kernels."""
     with dr.suspend_grad(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.sync_thread()
         dr.kernel_history_clear()
-        value = function()
-        dr.eval(value)
+        dr.eval(function())
         dr.sync_thread()
-        history = dr.kernel_history()
-    return Timed(value, compat.kernel_seconds(history))
+        return compat.kernel_seconds(dr.kernel_history())
 
 
 def total(values) -> tuple[object, int]:

@@ -3,8 +3,6 @@
 All figures have a title, a constrained layout and a caption.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import textwrap

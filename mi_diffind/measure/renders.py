@@ -6,8 +6,6 @@ that a surface that faces the light displays the texture's values. The scale of 
 pixel, so that a scene means the same for textures and images of any size.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Sequence

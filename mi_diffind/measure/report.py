@@ -1,7 +1,5 @@
 """Report of a result: tables, pictures and lines of text, and the files of a study, which bear its name."""
 
-from __future__ import annotations
-
 import csv
 import io
 import os

@@ -1,7 +1,5 @@
 """Statistics of measurements: medians and quartiles, times and ratios without the floor."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 

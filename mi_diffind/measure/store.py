@@ -1,7 +1,5 @@
 """Folder of trained models, and fingerprints of the files that models and references depend on."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib.util
 import os

@@ -17,8 +17,6 @@ The chosen depth is the smallest at which the rest of the whole image is below t
 below ten times the tolerance.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Sequence

@@ -4,8 +4,6 @@
 them. Each fetched file is pinned by its SHA-256, so that figures of the pages are those of the very files.
 """
 
-from __future__ import annotations
-
 import filecmp
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """Description of a table file, or of all plugins of this package in a scene: ``mi_diffind.inspect``."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import re

@@ -18,7 +18,7 @@ import numpy as np
 
 from .. import plugins
 from ..core import compat, tensor_files, units
-from ..core.errors import DiffindError, UsageError
+from ..core.errors import DiffindError, UsageError, raised_as
 from ..core.files import check_scene_file, replacing
 from ..core.runtime import use_variant
 from ..core.threads import in_turn, threads_for_files
@@ -113,12 +113,10 @@ class ParsedScene:
         self.path = path = Path.cwd() / name if in_memory else Path(source)
         self.defines = {name: str(value) for name, value in (defines or {}).items()}
         self._resolver = None  # parsing adds the folders of <path> to it
-        try:
-            if not in_memory:
+        if not in_memory:
+            with raised_as(SceneError, UsageError, SourceError):
                 check_scene_file(path)
                 self.path = path = model_scene(path) if is_model(path) else path
-        except (UsageError, SourceError) as e:
-            raise SceneError(str(e)) from None
         with self._errors():
             if in_memory:
                 _, self._state = compat.parse(source)

@@ -1,7 +1,5 @@
 """Poses of cameras: evenly spread directions, look-at matrices and rotations about an axis."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -30,18 +28,15 @@ def orbit_directions(views: int, test: int, low: float, high: float) -> tuple[np
     Elevations are radians. Test directions lie between the others, as evenly as their numbers allow.
     """
     between = (np.floor((np.arange(test) + 0.5) * views / max(test, 1)) + 0.5) / views
-    return _orbit(np.arange(views) / views, low, high), _orbit(between, low, high)
+    azimuths = (2 * np.pi * turns for turns in (np.arange(views) / views, between))
+    train, tests = (_unit(a, (low + high) / 2 - (high - low) / 2 * np.cos(a)) for a in azimuths)
+    return train, tests
 
 
 def _lattice(count: int, low: float, high: float, turn: float) -> np.ndarray:
     i = np.arange(count)
     z = math.sin(low) + (math.sin(high) - math.sin(low)) * (i + 0.5) / max(count, 1)
     return _unit(GOLDEN * i + turn, np.arcsin(z))
-
-
-def _orbit(turns: np.ndarray, low: float, high: float) -> np.ndarray:
-    azimuth = 2 * np.pi * turns
-    return _unit(azimuth, (low + high) / 2 - (high - low) / 2 * np.cos(azimuth))
 
 
 def _unit(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:

@@ -29,7 +29,7 @@ import numpy as np
 
 from .. import __version__
 from ..core.archives import Archive
-from ..core.errors import UsageError
+from ..core.errors import UsageError, raised_as
 from ..core.files import OutputError, replacing, writable_file, writable_folder
 from ..core.progress import interruptible, progress_bar
 from ..core.runtime import use_variant
@@ -144,12 +144,9 @@ def write_reference(path: Path, reference: Reference) -> None:
         part("image", image, np.float16, **{_ATTRIBUTE: json.dumps(about, sort_keys=True)}),
         part("blocks", means, np.float32),
     ]
-    with replacing(path) as temporary:
-        try:
-            with OpenEXR.File(parts) as file:
-                file.write(str(temporary))
-        except RuntimeError as e:
-            raise OutputError(f'reference "{path}" cannot be written: {e}') from None
+    refused = raised_as(OutputError, RuntimeError, at=f'reference "{path}" cannot be written')
+    with replacing(path) as temporary, refused, OpenEXR.File(parts) as file:
+        file.write(str(temporary))
 
 
 def _parts(path: Path) -> list[tuple[dict, dict]]:

@@ -1,7 +1,5 @@
 """Rendering of a scene or of cameras that move through it: ``mi_diffind.render``, to the path depth that is needed."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

@@ -6,8 +6,6 @@ group ``mi_diffind.studies`` names, declares one. Studies load plugins, so this 
 comparisons in equal bytes, :mod:`.shaded_scenes` the renders of a study.
 """
 
-from __future__ import annotations
-
 import argparse
 import functools
 import importlib
@@ -19,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..core import discovery
-from ..core.errors import UsageError
+from ..core.errors import UsageError, raised_as
 from ..core.files import writable_folder
 from ..core.runtime import use_variant
 from ..measure.study import Study, Tradeoff
@@ -115,10 +113,8 @@ def run(study: Study, arguments, set_variant: Callable[[], object] = use_variant
 
     ``set_variant()`` sets the variant once the arguments are checked.
     """
-    try:
+    with raised_as(UsageError, ValueError):
         study.check(arguments)
-    except ValueError as e:
-        raise UsageError(str(e)) from None
     writable_folder(arguments.out, create=True)
     set_variant()
     import mitsuba as mi

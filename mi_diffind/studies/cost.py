@@ -11,8 +11,6 @@ Times are those of the processor, on one core, with the tracing of kernels by Py
 a process of its own, because Dr.Jit compiles the materials of all scenes of a process into each kernel.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import multiprocessing

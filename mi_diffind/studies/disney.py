@@ -4,8 +4,6 @@
 is timed beside them. Errors are measured against :mod:`~mi_diffind.tasks.disney.model`, formulas that no plugin shares.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Equal-memory comparison: each method is trained once per memory budget; trainings by presets of ``fit``."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 import mitsuba as mi

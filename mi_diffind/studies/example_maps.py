@@ -5,8 +5,6 @@ All maps are 8-bit, as in files, and repeat. ``hammered`` is a metal with texel-
 coat.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..core.errors import UsageError

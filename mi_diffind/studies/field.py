@@ -10,8 +10,6 @@ Errors are PSNR of sRGB values before white in held-out views: of the pixels of 
 (``psnr_foreground_db``) and of all pixels (``psnr_white_db``), which flatters.
 """
 
-from __future__ import annotations
-
 import argparse
 import functools
 from dataclasses import dataclass, replace

@@ -7,8 +7,6 @@ the same samples with the same error measure, until they converge (:mod:`~mi_dif
 conductor that is built from the distribution is timed beside Mitsuba's.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

@@ -8,8 +8,6 @@ Errors are those of the values in the source's files; FLIP is a mean over maps, 
 normals or roughness are also compared as they are seen (:mod:`mi_diffind.maps.as_seen`).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -5,8 +5,6 @@ a network, trained to convergence. All are measured by their *levels*: name of a
 values in the source's files, clipped to the [0, 1] of 8-bit codecs.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ against renders of exact plugins, with the footprints of one and of four samples
 not counted (:func:`.product_error`). All trainings inside a scene have the exposure of the measurement.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import gc

@@ -142,7 +142,9 @@ class DistanceStudyContext:
     @functools.cached_property
     def samples(self) -> PairProblem:
         """Points that a network is trained on and measured at, and the frame of its field."""
-        return rivals.network_samples(self.distances, self.types, *self.settings.samples)
+        # As far from the surface as those of arrays with half as many entries along each side as the finest grid
+        shapes = ((rivals.FINEST // 2,) * 3, (2,) * 3)
+        return PairProblem(self.distances, shapes, "constant", self.types, 1, *self.settings.samples)
 
     def record(self, model: DistanceField, nbytes: int, **details) -> dict:
         """Return the record of a field with its errors; ``iou_near_db`` is the wrong share near the surface, in dB."""
@@ -236,7 +238,9 @@ def plan(mesh: Mesh, name: str, settings: SimpleNamespace) -> Plan:
             if method != "hash":  # no bound of its slope is known
                 queries[job.name] = lambda f=job.model: [marching.trace(f, o, d, dr.inf)[0]]
         scenes = {MESH: mesh_scene(mesh), grid: grid_scene(timed["ours"].model, settings.grid)}
-        return {"ray": queries | {n: (lambda s=scene: [scene_distance(s, o, d)]) for n, scene in scenes.items()}}
+        for name, scene in scenes.items():  # which have to live until the results are evaluated
+            queries[name] = lambda s=scene: [s.ray_intersect_preliminary(mi.Ray3f(o, d), coherent=True).t]
+        return {"ray": queries}
 
     nbytes = {MESH: 12 * (len(mesh.vertices) + len(mesh.faces)), grid: 4 * settings.grid**3}
     compared = [timed[method].name for method in SHOWN[:2]]
@@ -305,11 +309,6 @@ def grid_scene(field: DistanceField, resolution: int) -> mi.Scene:
     to_world = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())
     grid = mi.TensorXf(np.ascontiguousarray(values[..., None], np.float32))
     return mi.load_dict({"type": "scene", "shape": {"type": "sdfgrid", "grid": grid, "to_world": to_world}})
-
-
-def scene_distance(scene, o, d):
-    """Return the length of rays until they meet a scene, which has to live until the result is evaluated."""
-    return scene.ray_intersect_preliminary(mi.Ray3f(o, d), coherent=True).t
 
 
 def draw_normals(context: DistanceStudyContext, jobs: list[Contender], result: dict):

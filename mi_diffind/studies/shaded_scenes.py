@@ -6,8 +6,6 @@ the errors of two independent halves are multiplied. PSNR is that of values clip
 the truth's pixels are brighter; brightness is that of values up to 16, so that no single mirror of the sun decides it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -14,8 +14,6 @@ FLIP against C, the converged truth, and P, the paper's reference. Last, whole r
 ours, and the best filter in equal bytes.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

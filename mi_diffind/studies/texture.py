@@ -11,8 +11,6 @@ pixel's centre.
 magnified. *Levels*: the error of each level of detail at its texel centres, of all maps. *Time*: that of renders.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 from collections.abc import Callable

@@ -88,13 +88,10 @@ class TrackedParameter:
             self._arrays, self._bounds = None, ValueBounds()  # values cannot be evaluated, or need not be
         elif self.changed():
             # The copies keep the arrays alive, so that no other one gets their index
-            self._arrays, self._bounds = [dr.detach(v) for v in self._values()], self._compute_bounds()
-
-    def _compute_bounds(self) -> ValueBounds:
-        values = value_bounds(self.texture, self.colour)
-        if self.is_eta:  # an index of 1 reflects nothing
-            return ValueBounds(0, 0) if values.is_always(1) else ValueBounds(0, math.inf)
-        return values
+            self._arrays, bounds = [dr.detach(v) for v in self._values()], value_bounds(self.texture, self.colour)
+            if self.is_eta:  # an index of 1 reflects nothing
+                bounds = ValueBounds(0, 0) if bounds.is_always(1) else ValueBounds(0, math.inf)
+            self._bounds = bounds
 
     def bounds(self) -> ValueBounds:
         """Return the bounds of the last :meth:`update`; unknown if the arrays changed or are being optimised."""

@@ -21,9 +21,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from mi_diffind.arrays.tables import TableError
 from mi_diffind.core import compat
-from mi_diffind.core.errors import DiffindError
 from mi_diffind.core.files import is_within, stamp
 from mi_diffind.tasks.sdf import TASK, marching
 from mi_diffind.tasks.sdf.mesh import edge_balance, load_mesh, read_serialized, split_part
@@ -453,10 +451,8 @@ SMOOTH_DEG = 3.0
 def to_mesh(props: mi.Properties) -> None:
     """Replace the ``filename`` of a ``neural_sdf`` by that of its mesh, as a ``ply`` file."""
     path = Path(properties.filename(props))
-    try:
+    with properties.refused_as():
         settings = TASK.load(path).settings
-    except TableError as e:
-        raise RuntimeError(str(e)) from None
     recorded = settings.get("mesh_path")
     if not recorded:
         raise RuntimeError(f"{path}: names no mesh that it was made from")
@@ -543,10 +539,8 @@ def _folder() -> tempfile.TemporaryDirectory:
 @functools.lru_cache
 def _as_ply(path: Path, stamp: tuple) -> tuple[str, str]:
     """Return the digest of a mesh file, and the path of the mesh as a PLY file, kept until the process ends."""
-    try:
+    with properties.refused_as():
         mesh = load_mesh(path)
-    except DiffindError as e:
-        raise RuntimeError(str(e)) from None
     if path.suffix.lower() == ".ply":
         return mesh.digest, str(path)
     written = Path(_folder().name) / f"{split_part(path)[0].stem}_{abs(hash((path, stamp))):x}.ply"

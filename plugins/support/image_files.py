@@ -24,7 +24,7 @@ from mi_diffind.maps.source import Source, from_arrays, load_source
 
 from .. import warn
 from . import properties
-from .properties import Kept, StockNode, refused_as
+from .properties import Kept, StockNode, refused_as, remove
 from .tables import Tables, lock, shared
 from .textures import TYPES, after_transform, transformation
 
@@ -211,13 +211,6 @@ def to_mipmap(task: Task, props: mi.Properties) -> None:
         props["channels"] = layout.name
     if "raw" not in props and is_data(layout):
         props["raw"] = True
-
-
-def remove(props: mi.Properties, *names: str) -> None:
-    """Remove properties, those that are there."""
-    for name in names:
-        if name in props:
-            del props[name]
 
 
 def find_original(task: Task, props: mi.Properties) -> tuple[Path, MapLayout]:

@@ -10,7 +10,6 @@ import mitsuba as mi
 import numpy as np
 
 from mi_diffind.arrays.boxes import box_interval
-from mi_diffind.arrays.tables import TableError
 from mi_diffind.core import compat
 from mi_diffind.tasks.radiance import march as marching
 from mi_diffind.tasks.radiance.files import load
@@ -203,10 +202,8 @@ def to_grid(props: mi.Properties) -> None:
     Raises ``RuntimeError`` if the grid was not kept or its file does not exist.
     """
     path = Path(properties.filename(props))
-    try:
+    with properties.refused_as():
         table = load(path)
-    except TableError as e:
-        raise RuntimeError(str(e)) from None
     if table.settings["layout"] == "grid":
         return
     grid_path = table.settings.get("grid_path")
@@ -221,8 +218,7 @@ def to_grid(props: mi.Properties) -> None:
             f'FOLDER --preset grid -o {grid.name}" makes it again'
         )
     props["filename"] = str(grid)
-    if "storage" in props:
-        del props["storage"]
+    properties.remove(props, "storage")
 
 
 class JoinedField(VolumeField):

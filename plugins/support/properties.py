@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,16 +9,12 @@ from pathlib import Path
 import mitsuba as mi
 
 from mi_diffind.arrays.tables import Table
-from mi_diffind.core.errors import DiffindError
+from mi_diffind.core.errors import DiffindError, raised_as
 
 
-@contextlib.contextmanager
 def refused_as(name: str = ""):
     """Raise errors of this package as ``RuntimeError``, as Mitsuba's plugins do; ``name`` is the parameter at fault."""
-    try:
-        yield
-    except DiffindError as e:
-        raise RuntimeError(f'parameter "{name}": {e}' if name else str(e)) from None
+    return raised_as(RuntimeError, DiffindError, at=f'parameter "{name}"' if name else "")
 
 
 def one_of(props: mi.Properties, name: str, allowed: tuple[str, ...]) -> str:
@@ -52,6 +47,13 @@ def check_range(props: mi.Properties, name: str, low: float, high: float) -> Non
         value = float(props[name])
         if not low <= value <= high:  # NaN, too
             raise RuntimeError(f'parameter "{name}": found {value:g}, allowed is [{low}, {high}]')
+
+
+def remove(props: mi.Properties, *names: str) -> None:
+    """Remove properties, those that are there."""
+    for name in names:
+        if name in props:
+            del props[name]
 
 
 def filename(props: mi.Properties) -> str:

@@ -40,6 +40,14 @@ def open_tables(props: mi.Properties, task: Task, storage: str = "") -> Model:
     return task.open(mi.TensorXf, properties.filename(props), preset, given or storage)
 
 
+def file_and_storage(props: mi.Properties, task: str) -> tuple[str, str]:
+    """Return the properties ``filename``, a file of a task, and ``storage``. Raises ``RuntimeError``."""
+    path, storage = properties.filename(props), properties.one_of(props, "storage", ("uint8", "float32"))
+    if not path:
+        raise RuntimeError(f'parameter "filename": not given, a file of "mi-diffind fit {task}" is needed')
+    return path, storage
+
+
 class Entries:
     """Entries that are exposed as parameters ``tables.NAME``, of their shape and in memory of Dr.Jit.
 

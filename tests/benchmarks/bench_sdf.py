@@ -67,8 +67,8 @@ def measured(file: Path, resolution: int, rounds: int) -> dict:
         o, d = rays(ray_set)
         passes = {name: functools.partial(run, o, d, ray_set == "primary") for name, run in runs.items()}
         results = by_turns({name: functools.partial(timed, run) for name, run in passes.items()}, rounds, warm=2)
-        seconds = {name: np.array([result.seconds for result in values]) for name, values in results.items()}
-        hits = {name: np.array(values[-1].value[1]) for name, values in results.items()}
+        seconds = {name: np.array(values) for name, values in results.items()}
+        hits = {name: np.array(run()[1]) for name, run in passes.items()}
         for name, values in seconds.items():
             ratio = spread(values / seconds[MESH])
             rows.append({

@@ -64,7 +64,7 @@ def textures(path: Path) -> tuple[dict[str, list], list[int]]:
 
 def rounds(functions: dict, number: int) -> dict[str, np.ndarray]:
     """Return the seconds of the kernels of each function, by turns."""
-    measured = {name: lambda f=function: timed(lambda: total(f())[0]).seconds for name, function in functions.items()}
+    measured = {name: lambda f=function: timed(lambda: total(f())[0]) for name, function in functions.items()}
     return {name: np.array(values) for name, values in by_turns(measured, number).items()}
 
 

@@ -25,7 +25,7 @@ class Size:
     full: bool = False
 
 
-def search(quality, goal, interrupt=None, size_of=lambda n: Size(round(n)), **options):
+def search(quality, goal, interrupt=None, size_of=lambda n: Size(round(n))):
     """Return the search by trainings of ``quality(octaves)`` dB, and their (bytes, steps); Ctrl-C comes in one."""
     calls = []
 
@@ -35,7 +35,7 @@ def search(quality, goal, interrupt=None, size_of=lambda n: Size(round(n)), **op
         result = FitResult({}, 1, 1, 0.0, len(calls) == interrupt, 0)
         return SimpleNamespace(nbytes=size.nbytes, measured={"psnr_db": psnr}), result
 
-    return search_by_psnr(SOURCE, goal, REQUEST, SETTINGS, size_of, train, **options), calls
+    return search_by_psnr(SOURCE, goal, REQUEST, SETTINGS, size_of, train), calls
 
 
 @pytest.mark.parametrize("slope, bend", [(2.5, 0), (0.9, 0), (6, 0), (3, 0.15)])
@@ -71,7 +71,7 @@ def test_a_quality_that_jumps(goal):
 
 
 def test_the_search_ends():
-    """At the largest and the smallest arrays, and after ``most`` trainings of full length."""
+    """At the largest and the smallest arrays, and after :data:`TRAININGS` trainings of full length."""
     with pytest.raises(FittingError, match=r"100 dB were not reached; the best of . trainings had .* give more"):
         search(lambda octaves: 25 + octaves, 100)
     _, calls = search(lambda octaves: 25 + octaves, 1, size_of=lambda n: Size(max(round(n), 5000)))
@@ -79,7 +79,7 @@ def test_the_search_ends():
     with pytest.raises(FittingError, match="in 7,000 bytes"):
         search(lambda octaves: 25 + octaves, 50, size_of=lambda n: Size(min(round(n), 7000), n >= 7000))
     with pytest.raises(FittingError, match="not reached"):
-        search(lambda octaves: 20 + octaves % 1, 30, most=1)
+        search(lambda octaves: 20 + octaves % 1, 30)
 
 
 def test_the_search_is_interrupted():

@@ -120,7 +120,7 @@ def test_grids_are_as_fine_as_the_bytes_allow():
 def test_hash_grid(rng):
     """A network learns distances on the samples of the supplement's arrays; gradients are those of the values."""
     ball = Ball()
-    samples = rivals.network_samples(ball, T, 2**13, 2**10)
+    samples = rivals.PairProblem(ball, ((128,) * 3, (2,) * 3), "constant", T, 1, 2**13, 2**10)
     problem = rivals.HashProblem(samples, 40000)
     field = rivals.HashDistanceField(problem.net, samples.field)
     assert 0.8 * 40000 < field.nbytes <= 40000
@@ -149,10 +149,11 @@ def test_fields_and_meshes_are_in_one_place(mi_rgb):
     model = rivals.distance_nodes(T, Ball(), 1 / 30)
     o, d = sdf.camera_rays(64 * 64)
     scenes = sdf.mesh_scene(Ball.mesh), sdf.grid_scene(model, 48)  # what is not evaluated yet needs them
-    expected = sdf.scene_distance(scenes[0], o, d).numpy()
+    of_mesh, of_grid = (s.ray_intersect_preliminary(mi_rgb.Ray3f(o, d), coherent=True).t for s in scenes)
+    expected = of_mesh.numpy()
     hit = np.isfinite(expected)
     assert 0.1 < hit.mean() < 0.8
-    for t in (marching.trace(model, o, d, np.inf)[0], sdf.scene_distance(scenes[1], o, d)):
+    for t in (marching.trace(model, o, d, np.inf)[0], of_grid):
         t = t.numpy()
         assert np.mean(np.isfinite(t) != hit) < 0.03
         both = np.isfinite(t) & hit

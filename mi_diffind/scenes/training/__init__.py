@@ -5,8 +5,6 @@ References are renders of the same scene with exact plugins and many samples. Th
 is :mod:`mi_diffind.tasks.texture.shading`.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

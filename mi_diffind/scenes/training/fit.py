@@ -1,7 +1,5 @@
 """``fit scene SCENE.xml``: training of textures by differentiating renders of a scene that shows them."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import gc

@@ -1,7 +1,5 @@
 """Options of a training inside a scene: recipe, views and the arguments of ``fit scene``. Free of Mitsuba."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import math

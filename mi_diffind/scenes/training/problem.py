@@ -9,8 +9,6 @@ highlight on metal, a firefly) has a larger gradient than the bound. A component
 its own that could be clipped; the image has.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import statistics

@@ -1,7 +1,5 @@
 """Reference images of a scene: each view rendered once by exact plugins, in two halves, and kept in a folder."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import gc

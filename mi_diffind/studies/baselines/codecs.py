@@ -6,8 +6,6 @@ on them. An image whose sides are no multiples of the block size is padded by re
 padded blocks count.
 """
 
-from __future__ import annotations
-
 import functools
 import io
 import itertools
@@ -20,7 +18,7 @@ import numpy as np
 from PIL import Image
 
 from ...arrays.budget import Budget
-from ...core.errors import UsageError, missing_package
+from ...core.errors import UsageError, missing_package, raised_as
 
 #: Block sizes of ASTC in 2D, width × height, finest first; a block has 16 bytes.
 ASTC_BLOCKS = (
@@ -228,10 +226,9 @@ def _pillow(name: str, texels: np.ndarray, quality: int, **options) -> Encoded:
     decoded, size = np.empty(texels.shape, np.float32), 0
     for group in (([0],), ([0], [1]), ([0, 1, 2],), ([0, 1, 2], [3]))[texels.shape[2] - 1]:
         file, pixels = io.BytesIO(), texels[..., group[0] if len(group) == 1 else group]
-        try:
+        problem = f"{name} cannot store {texels.shape[1]}x{texels.shape[0]} texels"
+        with raised_as(UsageError, OSError, ValueError, at=problem):  # too large
             Image.fromarray(np.ascontiguousarray(pixels)).save(file, name.upper(), quality=quality, **options)
-        except (OSError, ValueError) as e:  # too large
-            raise UsageError(f"{name} cannot store {texels.shape[1]}x{texels.shape[0]} texels: {e}") from None
         size += file.tell()
         with Image.open(file) as opened:
             values = np.asarray(opened.convert("L" if len(group) == 1 else "RGB"))

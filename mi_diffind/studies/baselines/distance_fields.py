@@ -5,8 +5,6 @@ between ± ``band``; no step has its middle at zero, so no sign is lost. Bytes a
 and index.
 """
 
-from __future__ import annotations
-
 import math
 
 import drjit as dr
@@ -159,14 +157,6 @@ def network(nbytes: int) -> Network:
     return Network(3, WIDTH, LAYERS, hash_grid(3, nbytes, FINEST * math.sqrt(nbytes / 2**20), 1))
 
 
-def network_samples(distances: Distances, types, count: int, held_out: int) -> PairProblem:
-    """Return the training of the supplement's arrays whose ``count`` samples and ``held_out`` points networks share.
-
-    Samples reach as far from the surface as those of arrays with :data:`FINEST` / 2 entries along each side.
-    """
-    return PairProblem(distances, ((FINEST // 2,) * 3, (2,) * 3), "constant", types, 1, count, held_out)
-
-
 class HashDistanceField(LimitedField):
     """Field of a trained ``net`` in the box of a ``frame``; no bound of its slope is known.
 
@@ -187,7 +177,7 @@ class HashDistanceField(LimitedField):
 
 
 class HashProblem(Problem):
-    """Training of the largest :func:`network` of ``nbytes`` on the ``samples`` of :func:`network_samples`."""
+    """Training of the largest :func:`network` of ``nbytes`` on the ``samples`` of a training of arrays."""
 
     def __init__(self, samples: PairProblem, nbytes: int):
         self.samples, self.batch, self.identity = samples, samples.batch, samples.identity

@@ -15,8 +15,6 @@ The variance of slopes of a GGX lobe is infinite; in its place stands that of th
 α²/2 along each axis.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -3,8 +3,6 @@
 The codebook is the idea of VQRF (Li et al. 2023).
 """
 
-from __future__ import annotations
-
 import zlib
 
 import drjit as dr

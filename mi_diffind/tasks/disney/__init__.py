@@ -7,8 +7,6 @@
 - :mod:`.training`: training distributions, errors, and table files.
 """
 
-from __future__ import annotations
-
 from ...fitting.task import FitRequest, FitSettings, Task
 
 

@@ -5,8 +5,6 @@ A layout (:class:`.paper.PaperArrays`, :class:`.factored.FactoredArrays`) is a `
 defines their training: initial values, targets and predictions. Its decoder reads it.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from drjit import nn
 

@@ -8,8 +8,6 @@ Learned forms replace some of its methods by reads (:class:`.factored.FactoredDe
 (:class:`.paper.PaperDecoder`). Sampling and densities (:mod:`.sampling`) always use the analytic coefficients.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

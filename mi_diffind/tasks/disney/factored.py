@@ -24,8 +24,6 @@ Terms of one cosine, Schlick's (1 − c)^5 and the clearcoat's masking, are comp
 less time than any read. With a table for them, the whole model was slower than Mitsuba's ``principled``.
 """
 
-from __future__ import annotations
-
 import drjit as dr
 import numpy as np
 

@@ -17,8 +17,6 @@ Parts that a material does not use are neither traced nor read nor sampled (:fun
 parameters). No value changes: each part has a factor that is exactly 0 for every value that the parameter can take.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from typing import Any
 

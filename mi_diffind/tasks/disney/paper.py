@@ -19,8 +19,6 @@ product of cosines is nevertheless far off at the horizon; :mod:`.factored` does
 comparison.
 """
 
-from __future__ import annotations
-
 import drjit as dr
 import numpy as np
 

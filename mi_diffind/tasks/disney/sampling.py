@@ -9,8 +9,6 @@ Same frame and conventions as :mod:`.model`; ``c`` are coefficients of :class:`.
 ``shares``), ``e`` the effects in use.
 """
 
-from __future__ import annotations
-
 import drjit as dr
 
 from .decoder import coat_quadric, masking, quadric

@@ -1,7 +1,5 @@
 """Task 1: the isotropic GGX distribution of normals (:mod:`.model`, :mod:`.training`)."""
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import asdict
 

@@ -28,8 +28,6 @@ Its choice matters more than the sizes and the training of the arrays:
 Roughness is drawn from an exponential-like distribution, as for the Disney BRDF, and clamped to α ≥ 0.001.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Training of task 1: samples, errors, the training problem, and table files."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable

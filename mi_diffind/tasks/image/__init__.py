@@ -4,8 +4,6 @@ Sources and stored channels are in :mod:`mi_diffind.maps`. :mod:`.arrays`: resol
 :mod:`.training`: the training problem; :mod:`.fit`: the command ``fit image``.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass

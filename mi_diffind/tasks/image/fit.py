@@ -1,7 +1,5 @@
 """``fit image``: checks of options, weights of maps, the choice of sizes by rule or by trainings, and the fit."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -11,12 +9,13 @@ from ...arrays.budget import Budget
 from ...arrays.pages import most_entries
 from ...arrays.tables import MAX_BYTES, Table
 from ...core.errors import UsageError
+from ...core.units import largest_fitting
 from ...fitting.task import FitRequest, FitResult, Fitted
 from ...maps import as_seen
 from ...maps.model import complete, load_maps, rehearse_pictures, requested_border, requested_bytes
-from ...maps.search import SHORT, TRAININGS, check_psnr, search_by_psnr, search_lines
+from ...maps.search import SHORT, check_psnr, search_by_psnr, search_lines
 from ...maps.source import Source
-from . import PAGED, STRUCTURES, CoarsePrimary, ImageSettings, parse_weights
+from . import PAGED, STRUCTURES, CoarsePrimary, ImageSettings
 from .arrays import CompressedImage, ImageBudget, cascaded_side, fit_bytes, search
 from .training import build_problem, choose_structure, fit_image, pointer_dims, source_layout
 
@@ -93,7 +92,15 @@ def _train(request: FitRequest, source: Source, recipe: ImageSettings) -> tuple[
     if not source_layout(source, recipe).stored:  # all channels are constant
         return Fitted(*fit_image(source, None, recipe, request, border), figures={"tried": []}), None
     if options["psnr"] is not None:
-        table, result, tried = psnr_search(source, float(options["psnr"]), recipe, request, border)
+
+        def train(size: ImageBudget, steps: int, limited: FitRequest, title: str) -> tuple[Table, FitResult]:
+            changed = dataclasses.replace(recipe, steps=steps, measure_every=min(recipe.measure_every, steps))
+            return fit_image(source, size, changed, limited, border, title)
+
+        goal = float(options["psnr"])
+        table, result, tried = search_by_psnr(
+            source, goal, request, recipe, lambda nbytes: default_size(source, nbytes, recipe), train
+        )
         return Fitted(table, result, search_lines(tried), {"tried": tried}), None
     requested = requested_bytes(options, source)
     tried, lines = [], []
@@ -222,25 +229,12 @@ def _candidates(recipe: ImageSettings, side: int, free: bool, leader: Callable) 
         yield from ((recipe, s) for s in SIDES[recipe.dims])
 
 
-def psnr_search(
-    source: Source, goal: float, recipe: ImageSettings, request: FitRequest, border=None, most: int = TRAININGS
-) -> tuple[Table, FitResult, list[dict]]:
-    """Search the smallest file whose ``psnr_db`` is at least ``goal``: :func:`.search_by_psnr` over default sizes."""
-
-    def train(size: ImageBudget, steps: int, limited: FitRequest, title: str) -> tuple[Table, FitResult]:
-        changed = dataclasses.replace(recipe, steps=steps, measure_every=min(recipe.measure_every, steps))
-        return fit_image(source, size, changed, limited, border, title)
-
-    return search_by_psnr(source, goal, request, recipe, lambda n: default_size(source, n, recipe), train, most)
-
-
 # ---------------------- Weights of maps ----------------------
 
 
 def _weights(request: FitRequest, source: Source, recipe: ImageSettings) -> dict[str, float]:
     """Return the weights of maps that differ from 1. Raises :class:`UsageError` for a map that the source lacks."""
     given = request.options["weights"]
-    given = parse_weights(given) if isinstance(given, str) else dict(given)
     if given == "equal":
         return {}
     if given == "auto":
@@ -249,7 +243,7 @@ def _weights(request: FitRequest, source: Source, recipe: ImageSettings) -> dict
     for name in given:
         if name not in (names := [m.name for m in source.maps]):
             raise UsageError(f'--weights: found the map "{name}", allowed are {", ".join(names)}')
-    return given
+    return dict(given)
 
 
 def weights_as_seen(source: Source, recipe: ImageSettings, nbytes: float, types: ModuleType) -> dict[str, float]:
@@ -290,9 +284,8 @@ def balance_weights(squares: Mapping[str, float], channels: Mapping[str, int]) -
     def decibels(shift: float) -> dict[str, float]:
         return {name: max(least[name], wanted[name] + shift) for name in squares}
 
-    low, high = -200.0, 200.0
-    for _ in range(60):
-        shift = 0.5 * (low + high)
-        total = sum(channels[name] * db for name, db in decibels(shift).items())
-        low, high = (shift, high) if total < 0 else (low, shift)
-    return {name: float(f"{10 ** (db / 20):.3g}") for name, db in decibels(low).items()}
+    def too_small(shift: float) -> bool:
+        return sum(channels[name] * db for name, db in decibels(shift).items()) < 0
+
+    shift = largest_fitting(too_small, -200.0, 200.0, steps=60)
+    return {name: float(f"{10 ** (db / 20):.3g}") for name, db in decibels(shift).items()}

@@ -5,8 +5,6 @@ value at a jittered place within it. The supplement's recipe jitters all samples
 picture. Half of the steps at centres and half jittered is better both at texels and between them.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
@@ -207,15 +205,11 @@ def fit_image(
     problem = build_problem(source, size, recipe, request.types, layout, border) if layout.stored else None
     more = {}
     if problem is not None:
-        more = {"ratio": size.ratio, "structure": recipe.structure if recipe.structure != "auto" else _name_of(size)}
+        names = [n for n, s in STRUCTURES.items() if s == (size.bits, size.coarse) and size.paged == (n in PAGED)]
+        names = [recipe.structure] if recipe.structure != "auto" else [*names, ""]
+        more = {"ratio": size.ratio, "structure": names[0]}
 
     def stored() -> CompressedImage:
         return CompressedImage(layout, problem and stored_form(problem.net, problem.bits))
 
     return fit_maps(request, source, problem, stored, to_table, CompressedImage.from_table, title, **more)
-
-
-def _name_of(size: ImageBudget) -> str:
-    """Return the name of the structure of a size, "" for one that is not in :data:`.STRUCTURES`."""
-    known = (name for name, s in STRUCTURES.items() if s == (size.bits, size.coarse) and size.paged == (name in PAGED))
-    return next(known, "")

@@ -8,8 +8,6 @@
 - :mod:`.fit`, :mod:`.files`, :mod:`.model`: the steps of ``fit field`` and its result.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import log, prod
 

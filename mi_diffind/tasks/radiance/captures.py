@@ -23,8 +23,6 @@ PNG and JPEG hold sRGB, not multiplied by alpha; EXR holds linear values multipl
 opaque everywhere.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import math
@@ -35,7 +33,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from ...core.archives import Allowance, LimitError, json_bytes
-from ...core.errors import DiffindError, missing_package, reason
+from ...core.errors import DiffindError, missing_package, raised_as, reason
 from ...core.files import MOST_TEXT, OutsideError, RecordedKeys, irregular, path_by_name, shown, unused_note
 from ...core.units import memory
 from ...images.reader import ENCODED, Picture, PictureError, read_picture
@@ -72,10 +70,8 @@ def image_file(root: Path, name: str, file: Path) -> Path:
     if Path(name).suffix.lower() in JPEG:
         names += [str(Path(name).with_suffix(suffix)) for suffix in JPEG]
     for spelling in names:
-        try:
+        with raised_as(ViewsError, OutsideError):
             path = path_by_name(root, spelling, file)
-        except OutsideError as e:
-            raise ViewsError(str(e)) from None
         if fault := irregular(path, memory() // 4):
             raise ViewsError(f"{shown(path)}: {fault}, {file.name} names it")
         if path.is_file():
@@ -119,10 +115,8 @@ def read_image(path: Path) -> tuple[np.ndarray, bool]:
 
 
 def _read(path: Path) -> Picture:
-    try:
+    with raised_as(ViewsError, PictureError):
         return read_picture(path)
-    except PictureError as e:
-        raise ViewsError(str(e)) from None
 
 
 def _as_bytes(values: np.ndarray) -> np.ndarray:

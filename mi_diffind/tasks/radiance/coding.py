@@ -6,8 +6,6 @@ mean the same symbols everywhere. Nodes are coded in passes, from every fourth a
 most lie between coded ones, which are the context of their symbols.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

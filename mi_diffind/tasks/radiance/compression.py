@@ -7,8 +7,6 @@ the sum of squared derivatives of the images' sRGB values, estimated by derivati
 (Hutchinson). The palette and the levels are then trained through the images.
 """
 
-from __future__ import annotations
-
 import zlib
 from dataclasses import dataclass
 

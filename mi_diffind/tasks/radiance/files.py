@@ -1,7 +1,5 @@
 """Table files of radiance fields: arrays of each layout, checks, and the field of a table."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Iterator
@@ -80,9 +78,9 @@ def coded_arrays(stored: np.ndarray, numbers: PaletteArrays) -> dict[str, Stored
     """Return the arrays of the layout "coded" for a mask of ``stored`` nodes."""
     levels, index, palette = numbers.levels[1:], numbers.index[1:], numbers.palette
     coding = encode(stored, levels, index, 2**numbers.density_bits, len(palette.entries))
-    arrays = dict(zip(("probabilities", "nodes"), (byte_array(part[:, None]) for part in coding), strict=True))
+    probabilities, symbols = (byte_array(part[:, None]) for part in coding)
     shared = {} if numbers.environment is None else {"environment": numbers.environment}
-    return {**arrays, "palette": palette, **shared}
+    return {"probabilities": probabilities, "nodes": symbols, "palette": palette, **shared}
 
 
 def palette_arrays(table: Table) -> tuple[np.ndarray, PaletteArrays]:
@@ -97,9 +95,12 @@ def palette_arrays(table: Table) -> tuple[np.ndarray, PaletteArrays]:
         levels = density.entries[:, 0], settings.get("density_bits", SPARSE_BITS), (density.offset[0], density.scale[0])
         return stored_flags(table), PaletteArrays(*levels, index[:, 0] | index[:, 1] << 8, *shared)
     bits, colours, shape = settings["density_bits"], len(arrays["palette"].entries), tuple(settings["shape"])
-    coding = (arrays[name].entries.tobytes() for name in ("probabilities", "nodes"))
+    coding, most = (arrays[name].entries.tobytes() for name in ("probabilities", "nodes")), MOST_STORED
+    if table.path is not None:  # as check_nodes allows
+        left = allowed(Path(table.path).stat().st_size) - _grid_bytes(shape)
+        most = min(most, max(0, left) // NODE_BYTES)
     try:
-        flags, levels, index = decode_once(*coding, shape, 2**bits, colours, _most_nodes(table.path, shape))
+        flags, levels, index = decode_once(*coding, shape, 2**bits, colours, most)
     except ValueError as e:
         if isinstance(e, TooManyNodes):
             check_nodes(table, e.count)
@@ -144,14 +145,6 @@ def _grid_bytes(shape) -> int:
     return int(0.55 * math.prod(shape) + 8 * (layer_count(shape) + 1) * math.prod(shape[1:]))
 
 
-def _most_nodes(path, shape) -> int:
-    """Return the most nodes that a coded file may store: those of :func:`check_nodes`."""
-    if path is None:
-        return MOST_STORED
-    left = allowed(Path(path).stat().st_size) - _grid_bytes(shape)
-    return min(MOST_STORED, max(0, left) // NODE_BYTES)
-
-
 def grid_table(grid: NodeGrid, dtype=np.float16) -> Table:
     """Return the table of a grid, in half precision by default; the first entry stands for no node."""
     arrays, settings = stored_nodes(grid.nodes)
@@ -163,11 +156,12 @@ def grid_table(grid: NodeGrid, dtype=np.float16) -> Table:
     return Table("field", arrays, settings={"layout": "grid", **settings})
 
 
-def pairs_table(nodes: Nodes, arrays: dict, low, high) -> Table:
-    """Return the table of the pairs of the supplement; ``arrays`` maps names to arrays of a file."""
-    masks, settings = stored_nodes(nodes)
-    ranges = {"low": [float(v) for v in low], "high": [float(v) for v in high]}
-    return Table("field", {**masks, **arrays}, settings={"layout": "pairs", **ranges, **settings})
+def pairs_table(field: PairsField) -> Table:
+    """Return the table of a field of the pairs of the supplement."""
+    masks, settings = stored_nodes(field.nodes)
+    arrays = {name: StoredArray.of(module.quantised(8)) for name, module in field.modules.items()}
+    settings = {"layout": "pairs", "low": field.low, "high": field.high, **settings}
+    return Table("field", {**masks, **arrays}, settings=settings)
 
 
 def load(path) -> Table:

@@ -1,7 +1,5 @@
 """``fit field``: from a folder of views to a grid, from a grid to a compressed field, trained and measured."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import os
@@ -15,11 +13,11 @@ import numpy as np
 
 from ...arrays.tables import MAX_BYTES, Table, save_table
 from ...core import units
-from ...core.errors import UsageError
+from ...core.errors import UsageError, raised_as
 from ...core.files import check_distinct
 from ...core.progress import Deadline, interruptible
 from ...fitting.loop import FitResult, FittingError, cores
-from ...fitting.task import FitRequest, Fitted, Stage
+from ...fitting.task import FitRequest, Fitted, Stage, significant
 from . import COLOURS, PRESETS, RESOLUTIONS, compression, dense_bytes, files, paper, ratio_for, scale_steps
 from . import grid as grids
 from .grid import NodeGrid
@@ -78,23 +76,13 @@ def check(request: FitRequest) -> None:
             raise UsageError(message)
     for name in ("bytes", "disk"):
         if options.get(name) is not None:
-            units.check_size(f"--{name}", _parsed(options, name), MAX_BYTES)
-    _parsed(options, "compression")
+            units.check_size(f"--{name}", options[name], MAX_BYTES)
     nodes = options["resolution"] or RESOLUTIONS[0]
     units.check_memory("--resolution", nodes, 24 * nodes**3)  # bytes for each node of the dense grid, roughly
     if request.checkpoint is not None:
         parts = ("grid.npz", *(f"stage{n}" for n in range(len(STAGES))))
         beside = [f"{os.fspath(request.checkpoint)}.{part}" for part in parts]
         check_distinct({"-o": request.output, "--grid": options["grid"]}, {"a file beside --checkpoint": beside})
-
-
-def _parsed(options, name: str):
-    """Return the value of an option that is a size or a ratio, or ``None``. Raises :class:`UsageError`."""
-    parse = units.parse_compression if name == "compression" else units.parse_bytes
-    try:
-        return None if options.get(name) is None else parse(options[name])
-    except ValueError as e:
-        raise UsageError(f"--{name}: {e}") from None
 
 
 def fit(request: FitRequest) -> Fitted:
@@ -147,7 +135,7 @@ class FieldFit:
             "warnings": warnings,
             **table.settings,
         }
-        table.measured = five_digits(measured)
+        table.measured = significant(measured)
         dense = dense_bytes(grid.nodes.shape)
         seconds = time.perf_counter() - start - grid_seconds
         lines = [f"{grid_seconds:.1f} s for the grid, {seconds:.1f} s for the rest"]
@@ -183,7 +171,7 @@ class FieldFit:
             table = self.grid_table(grid)
             table.preset, table.settings = "grid", {**table.settings, "source": views.digest}
             visible = files.field_of(table, request.types)  # in half precision
-            table.measured = five_digits(self.session.held_out_images.evaluate(visible, ssim=True))
+            table.measured = significant(self.session.held_out_images.evaluate(visible, ssim=True))
             save_table(path, table)
             grid = files.grid_of(files.load(path), request.types)
         return grid, result
@@ -339,8 +327,8 @@ class FieldFit:
 
     def wanted_bytes(self, grid: NodeGrid) -> int | None:
         """Return the bytes in memory that the options ask for, or ``None``."""
-        ratio = _parsed(self.request.options, "compression")
-        return _parsed(self.request.options, "bytes") or (ratio and round(dense_bytes(grid.nodes.shape) / ratio))
+        nbytes, ratio = (self.request.options.get(name) for name in ("bytes", "compression"))
+        return nbytes or (ratio and round(dense_bytes(grid.nodes.shape) / ratio))
 
     def train(self, problem: ImagesProblem, table: Callable[[], Table], stopped: bool) -> tuple[Table, FitResult]:
         """Train a problem through the images; return its ``table`` and the result.
@@ -362,15 +350,13 @@ class FieldFit:
 
     def sparse(self, grid: NodeGrid, stopped: bool) -> tuple[Table, FitResult]:
         """Compress a grid to density levels and a palette, in the bytes that the options ask for."""
-        disk, seed = _parsed(self.request.options, "disk"), self.request.settings.seed
+        disk, seed = self.request.options.get("disk"), self.request.settings.seed
         if disk is not None:
             coding = self.coding_in_file(grid, disk)
         else:
-            try:
+            given = "bytes" if self.request.options["bytes"] is not None else "compression"
+            with raised_as(UsageError, ValueError, at=f"--{given}"):
                 grid, bits = compression.in_memory(grid, self.session.seeing_images, self.wanted_bytes(grid))
-            except ValueError as e:
-                given = "bytes" if self.request.options["bytes"] is not None else "compression"
-                raise UsageError(f"--{given}: {e}") from None
             importance, limit = self.importance(grid)
             palette = compression.sorted_clusters(grid, importance, limit, 2**bits, seed)
             rate = compression.SLOPE * importance.loss / grid.nodes.count
@@ -401,9 +387,7 @@ class FieldFit:
         nbytes = self.wanted_bytes(grid) or dense_bytes(grid.nodes.shape) / 50  # as the help says
         grid = self.visible(grid)
         problem = self.pairs_problem(grid, nbytes, 0 if stopped else VALUE_STEPS)
-        return self.train(
-            problem, lambda: files.pairs_table(grid.nodes, problem.table_arrays(), problem.low, problem.high), stopped
-        )
+        return self.train(problem, lambda: files.pairs_table(problem.field()), stopped)
 
     def pairs_problem(self, grid: NodeGrid, nbytes: float, steps: int) -> paper.PairsProblem:
         """Return the arrays of the supplement in ``nbytes``, trained on the numbers of the grid for ``steps``."""
@@ -422,8 +406,3 @@ class FieldFit:
             settings = dataclasses.replace(request.settings, **settings)
             request.run([Stage("", values, 0.2, settings, "the numbers of the grid", resumable=False)])
         return paper.PairsProblem(net, grid.nodes, low, high, self.session)
-
-
-def five_digits(measured: dict[str, float]) -> dict[str, float]:
-    """Return measured figures with five digits, as a table keeps them."""
-    return {name: float(f"{value:.5g}") for name, value in measured.items()}

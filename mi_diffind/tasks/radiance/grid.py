@@ -221,7 +221,7 @@ def weights(field: NodeVolume, images: ViewImages) -> np.ndarray:
 def visible(grid: NodeGrid, images: ViewImages) -> np.ndarray:
     """Return the cells that some ray of the views sees, bool ``(X − 1, Y − 1, Z − 1)``.
 
-    In a field that is nearly empty, since its training has just add_reflections, they are those that are seen best.
+    In a field that is nearly empty, since its training has just begun, they are those that are seen best.
     """
     largest = weights(grid.field(), images)
     least = VISIBLE if grid.nodes.contraction is None else VISIBLE_SURROUNDINGS

@@ -10,8 +10,6 @@ Derivatives replay the ray (Vicini et al., *Path Replay Backpropagation*, SIGGRA
 from a step on and the transmittance T behind the step, ∂L/∂σ = δ (T c − R). There is no division.
 """
 
-from __future__ import annotations
-
 import drjit as dr
 
 from ...arrays.boxes import box_interval, is_direction

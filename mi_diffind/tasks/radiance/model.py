@@ -5,8 +5,6 @@ OpenVDB (``openvdb`` comes with conda-forge, Debian's ``python3-openvdb`` and Bl
 where it is installed and is not required.
 """
 
-from __future__ import annotations
-
 import importlib
 import math
 from pathlib import Path

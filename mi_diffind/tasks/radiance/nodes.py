@@ -70,7 +70,12 @@ class Nodes:
             self._columns = dr.opaque(types.UInt32, column_count(self.shape[2]))
             self.filled, self.columns = (device_array(types.UInt32, v) for v in (filled, columns))
         else:
-            self.index = device_array(types.UInt32, node_numbers(stored))
+            # The number of each node, 0 where the node or its next neighbour along z is not stored
+            numbers = np.zeros(stored.shape, np.uint32)
+            numbers[stored] = np.arange(1, np.count_nonzero(stored) + 1)
+            numbers[..., :-1][~stored[..., 1:]] = 0
+            numbers[..., -1] = 0
+            self.index = device_array(types.UInt32, numbers)
 
     @property
     def stored(self) -> np.ndarray:
@@ -292,15 +297,6 @@ def coarser(cells: np.ndarray) -> np.ndarray:
     padded = np.pad(cells, [(0, -n % COARSE) for n in cells.shape])
     x, y, z = (n // COARSE for n in padded.shape)
     return padded.reshape(x, COARSE, y, COARSE, z, COARSE).any(axis=(1, 3, 5))
-
-
-def node_numbers(stored: np.ndarray) -> np.ndarray:
-    """Return the number of each node, uint32; 0 where the node or its next neighbour along z is not stored."""
-    numbers = np.zeros(stored.shape, np.uint32)
-    numbers[stored] = np.arange(1, np.count_nonzero(stored) + 1)
-    numbers[:, :, :-1][~stored[:, :, 1:]] = 0
-    numbers[:, :, -1] = 0
-    return numbers
 
 
 def column_words(stored: np.ndarray, shape=None) -> tuple[np.ndarray, np.ndarray]:

@@ -4,8 +4,6 @@ The primary arrays begin as ramps, the cascaded arrays as the grid resampled to 
 empty, as in all fields here; the supplement keeps them.
 """
 
-from __future__ import annotations
-
 import math
 
 import drjit as dr
@@ -15,7 +13,6 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from ...arrays.budget import Budget, proportional_shape
 from ...arrays.indirection import DifferentiableArray, Indirection, ramp, rounded
-from ...arrays.tables import StoredArray
 from ...fitting.loop import Problem
 from .grid import NodeGrid
 from .nodes import Nodes
@@ -140,10 +137,9 @@ class PairsProblem(ImagesProblem):
         """Return the field of the trained arrays, rounded as they are stored."""
         return PairsField(self.nodes, rounded(net.density), rounded(net.colour), self.low, self.high)
 
-    def table_arrays(self) -> dict[str, StoredArray]:
-        """Return the trained arrays as a file stores them, by name."""
-        field = PairsField(self.nodes, self.net.density, self.net.colour, self.low, self.high)
-        return {name: StoredArray.of(module.quantised(8)) for name, module in field.modules.items()}
+    def field(self) -> PairsField:
+        """Return the field of the trained arrays."""
+        return PairsField(self.nodes, self.net.density, self.net.colour, self.low, self.high)
 
 
 class ValuesProblem(Problem):

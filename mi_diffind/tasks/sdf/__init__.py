@@ -7,8 +7,6 @@
 - :mod:`.model`: table files.
 """
 
-from __future__ import annotations
-
 from ...core import units
 from ...core.arguments import Argument, between, checked, positive
 from ...fitting.task import FitSettings, Task

@@ -3,8 +3,6 @@
 All lengths are relative to the mesh's longest side.
 """
 
-from __future__ import annotations
-
 import drjit as dr
 import numpy as np
 
@@ -30,11 +28,11 @@ HELD_OUT = 2**16
 class HeldOut:
     """Held-out points for a measurement during training: ``count`` near the surface, and ``count`` on it."""
 
-    def __init__(self, distances: Distances, types, width: float, seed: int = 3, count: int = HELD_OUT):
-        self.types, mesh = types, distances.surface
-        near = sample_near(mesh, count, width, seed).astype(np.float32)
+    def __init__(self, distances: Distances, types, width: float, count: int = HELD_OUT):
+        mesh = distances.surface
+        near = sample_near(mesh, count, width, seed=3).astype(np.float32)
         self.inside = distances.inside(near)
-        points, self.normals = sample_surface(mesh, count, seed + 1)
+        points, self.normals = sample_surface(mesh, count, seed=4)
         self.near, self.points = (
             types.Array3f(*(device_array(types.Float, column) for column in v.T)) for v in (near, points)
         )
@@ -57,37 +55,35 @@ class HeldOut:
 class SurfaceEvaluation:
     """Held-out points of ``mesh`` and errors of fields at them.
 
-    ``count`` points uniform in its box, padded by 0.05; ``count`` uniform among those within ``band`` of the surface;
-    ``count``/4 on the surface, uniform over its area.
+    ``count`` points uniform in its box, padded by 0.05; ``count`` uniform among those within :data:`BAND` of the
+    surface; ``count``/4 on the surface, uniform over its area.
     """
 
-    def __init__(self, mesh: Mesh, distances: Distances, count: int = 2**20, seed: int = 1, band: float = BAND):
-        self.mesh, self.distances, self.count, self.band = mesh, distances, count, band
+    def __init__(self, mesh: Mesh, distances: Distances, count: int = 2**20, seed: int = 1):
+        self.mesh, self.distances, self.count = mesh, distances, count
         rng = np.random.default_rng([seed, 7])
-        self.seed = seed
         self.uniform = sample_box(mesh.lower - PADDING, mesh.upper + PADDING, count, rng).astype(np.float32)
-        signed = distances.signed(self.uniform, band)
-        self.uniform_inside, self.uniform_near = signed < 0, np.abs(signed) < band
+        signed = distances.signed(self.uniform, BAND)
+        self.uniform_inside, self.uniform_near = signed < 0, np.abs(signed) < BAND
         self.near, self.near_distance = self._near(rng)
         self.surface, self.normals = sample_surface(distances.surface, max(1, count // 4), rng)
 
     def _near(self, rng) -> tuple[np.ndarray, np.ndarray]:
         """Draw uniform points of the band in the cells that reach into it; return them with their signed distances."""
-        band = self.band
-        lower = self.mesh.lower - 2 * band
-        shape = np.ceil((self.mesh.upper + 2 * band - lower) / band).astype(int)
-        cells = surface_cells(self.distances, lower, band, shape, reach=band)
+        lower = self.mesh.lower - 2 * BAND
+        shape = np.ceil((self.mesh.upper + 2 * BAND - lower) / BAND).astype(int)
+        cells = surface_cells(self.distances, lower, BAND, shape, reach=BAND)
         points, distance, have, tried = [], [], 0, 0
         while have < self.count:
             share = have / tried if have else 0.5
             wanted = int(1.05 * (self.count - have) / max(share, 0.1)) + 64
-            drawn = lower + band * (cells[rng.integers(len(cells), size=wanted)] + rng.random((wanted, 3)))
+            drawn = lower + BAND * (cells[rng.integers(len(cells), size=wanted)] + rng.random((wanted, 3)))
             drawn = drawn.astype(np.float32)
             d = self.distances.unsigned(drawn)
-            points.append(drawn[d < band])
-            distance.append(d[d < band])
+            points.append(drawn[d < BAND])
+            distance.append(d[d < BAND])
             have, tried = have + len(points[-1]), tried + wanted
-        self.band_volume = have / tried * len(cells) * band**3
+        self.band_volume = have / tried * len(cells) * BAND**3
         points, distance = np.concatenate(points)[: self.count], np.concatenate(distance)[: self.count]
         sign = np.where(self.distances.inside(points), -1, 1)
         return points, (sign * distance).astype(np.float32)
@@ -108,38 +104,31 @@ class SurfaceEvaluation:
         surface = point_values(field, self.surface).astype(np.float32)
         analytic = _angles(field, self.surface, self.normals, lambda p: field.gradient(p)[1])
         smooth = _angles(field, self.surface, self.normals, field.normal)
+        # Points of the band and others have weights by volume
+        box, far = np.prod(self.mesh.upper - self.mesh.lower + 2 * PADDING), ~self.uniform_near
+        near_overlap = _overlap(near < 0, self.near_distance < 0)
+        far_overlap = _overlap((point_values(field, self.uniform) < 0)[far], self.uniform_inside[far])
         return {
-            "iou": self._iou(point_values(field, self.uniform) < 0, near < 0),
-            "iou_near": _ratio(*_overlap(near < 0, self.near_distance < 0)),
-            "mae_near": float(
-                np.mean(np.abs(np.clip(near, -self.band, self.band) - self.near_distance), dtype=np.float64)
-            ),
+            "iou": _ratio(*(float(box) / self.count * far_overlap + self.band_volume / self.count * near_overlap)),
+            "iou_near": _ratio(*near_overlap),
+            "mae_near": float(np.mean(np.abs(np.clip(near, -BAND, BAND) - self.near_distance), dtype=np.float64)),
             "mae_surface": float(np.mean(np.abs(surface), dtype=np.float64)),
             "normal_deg": float(analytic.mean(dtype=np.float64)),
             "normal_p95_deg": float(np.quantile(analytic, 0.95)),
             "normal_smooth_deg": float(smooth.mean(dtype=np.float64)),
         }
 
-    def _iou(self, uniform: np.ndarray, near: np.ndarray) -> float:
-        """Combine the signs at uniform points and at points of the band, weighted by volume."""
-        side = self.mesh.upper - self.mesh.lower + 2 * PADDING
-        far = ~self.uniform_near
-        total = float(np.prod(side)) / self.count * _overlap(uniform[far], self.uniform_inside[far])
-        return _ratio(*(total + self.band_volume / self.count * _overlap(near, self.near_distance < 0)))
 
-
-def lost_pieces(field: DistanceField, distances: Distances, count: int = 32, seed: int = 2) -> int:
+def lost_pieces(field: DistanceField, distances: Distances) -> int:
     """Return how many pieces of the mesh's surface are missing in the field.
 
-    A piece is missing if the field's surface is further than one of its cells from all of ``count`` points on it.
+    A piece is missing if the field's surface is further than one of its cells from all of 32 points on it.
     """
-    surface = distances.surface
-    labels = surface.labels
-    rng = np.random.default_rng(seed)
-    order = np.argsort(labels, kind="stable")
-    first = np.searchsorted(labels[order], np.arange(surface.components + 1))
+    surface, rng = distances.surface, np.random.default_rng(2)
+    order = np.argsort(surface.labels, kind="stable")
+    first = np.searchsorted(surface.labels[order], np.arange(surface.components + 1))
     span = np.diff(first)[:, None]
-    triangles = order[first[:-1, None] + np.minimum(rng.random((len(span), count)) * span, span - 1).astype(np.int64)]
+    triangles = order[first[:-1, None] + np.minimum(rng.random((len(span), 32)) * span, span - 1).astype(np.int64)]
     weights = rng.dirichlet((1, 1, 1), triangles.shape)
     points = np.einsum("...c,...cx->...x", weights, surface.corners[triangles])
     near = np.abs(point_values(field, points.reshape(-1, 3))) < min(field.spacing, 0.99 * field.band)

@@ -4,8 +4,6 @@ Points are in the *unit frame*: the mesh's bounding box is centred at the origin
 are negative inside.
 """
 
-from __future__ import annotations
-
 from types import ModuleType
 
 import drjit as dr

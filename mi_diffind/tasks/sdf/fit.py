@@ -1,19 +1,16 @@
 """Training of distance fields (``fit sdf``): from a mesh and a number of bytes to a table file."""
 
-from __future__ import annotations
-
 import sys
 import time
 
 import drjit as dr
 import numpy as np
-from drjit import nn
 
 from ...arrays.budget import Budget, BudgetError
 from ...arrays.indirection import device_array, device_tensor
 from ...arrays.tables import MAX_BYTES, Table
 from ...core import units
-from ...core.errors import UsageError
+from ...core.errors import UsageError, raised_as
 from ...fitting.loop import Problem
 from ...fitting.task import FitRequest, Fitted, FittingError
 from . import TASK, encoding
@@ -93,23 +90,10 @@ class SurfaceSampler:
         return corner + u * first + v * second, normal
 
 
-class NodeValues(nn.Module):
-    """Trainable nodes of a sparse grid: ``values`` (n, 4), distances in spacings and normals of any length."""
-
-    DRJIT_STRUCT = {"values": dr.ArrayBase}  # noqa: RUF012
-
-    def __init__(self, values=None):
-        self.values = values
-
-    def unit(self, types):
-        """Return the nodes with normals of length 1."""
-        d, x, y, z = dr.unravel(types.Array4f, self.values.array)
-        inverse = dr.rsqrt(dr.maximum(x * x + y * y + z * z, 1e-12))
-        return types.TensorXf(dr.ravel(types.Array4f(d, x * inverse, y * inverse, z * inverse)), self.values.shape)
-
-
 class NodeProblem(Problem):
     """Training of a sparse grid's nodes against the surface itself.
+
+    The nodes are ``values`` (n, 4): distances in spacings, and normals of any length.
 
     The field is to be zero on the surface, and its gradient and its smooth normal are to be the surface's normal.
     Distances elsewhere are not needed, since the nodes begin with theirs.
@@ -122,13 +106,20 @@ class NodeProblem(Problem):
         self.sampled, self.types, self.held_out = sampled, types, held_out
         self.field, self.surface = SparseNodes(types, sampled.structure, 1.0), SurfaceSampler(mesh, types)
         start = np.concatenate([sampled.distances[:, None], sampled.normals], axis=1)
-        self.net = NodeValues(device_tensor(types.TensorXf, start))
+        self.net = {"values": device_tensor(types.TensorXf, start)}
         self.identity = {"source": mesh.digest, "nodes": len(start), "spacing": self.field.spacing}
         self.identity["bits"] = sampled.bits
 
+    def nodes(self, net):
+        """Return the nodes with normals of length 1."""
+        values, Array4f = net["values"], self.types.Array4f
+        d, x, y, z = dr.unravel(Array4f, values.array)
+        inverse = dr.rsqrt(dr.maximum(x * x + y * y + z * z, 1e-12))
+        return type(values)(dr.ravel(Array4f(d, x * inverse, y * inverse, z * inverse)), values.shape)
+
     def loss(self, net, rng, size: int):
         p, n = self.surface.draw(rng, size)
-        self.field.nodes = net.unit(self.types)
+        self.field.nodes = self.nodes(net)
         value, slope, smooth, complete = self.field.blend(p)
         Array3f = self.types.Array3f
         square = dr.square(value)
@@ -142,13 +133,13 @@ class NodeProblem(Problem):
 
     def measure(self, net):
         with dr.suspend_grad():
-            self.field.nodes = dr.detach(net.unit(self.types))
+            self.field.nodes = dr.detach(self.nodes(net))
             return self.held_out.measure(self.field)
 
     def table(self, seed: int) -> Table:
         """Return the coded nodes as a file holds them."""
         coding = encoding.NodeCoding(self.sampled, seed)
-        coding.encode(self.net.unit(self.types).numpy().astype(np.float64))
+        coding.encode(self.nodes(self.net).numpy().astype(np.float64))
         arrays, settings = coded_arrays(coding)
         return Table("sdf", arrays, settings=settings)
 
@@ -167,10 +158,7 @@ def check(request: FitRequest) -> None:
 
 def requested_bytes(options) -> int:
     """Return the size from the command's options. Raises :class:`UsageError`."""
-    try:
-        nbytes = BYTES if options["bytes"] is None else units.parse_bytes(options["bytes"])
-    except ValueError as e:
-        raise UsageError(f"--bytes: {e}") from None
+    nbytes = options["bytes"] or BYTES
     units.check_size("--bytes", nbytes, MAX_BYTES)
     units.check_memory("--bytes", nbytes, SAMPLE_BYTES * nbytes)
     return nbytes
@@ -252,12 +240,10 @@ def search_grid(distances: Distances, nbytes: int, bits: int) -> encoding.Sample
         aim = spacing * np.sqrt(expected / max((1 - TOLERANCE / 2) * nbytes - fixed, 1))
         return float(np.clip(aim, FINEST_SPACING, COARSEST_SPACING))
 
-    try:
+    with raised_as(UsageError, BudgetError, at="--bytes"):
         best = budget.approach(
             lambda spacing: encoding.sample(distances, spacing, bits), FIRST_SPACING, following, attempts=6
         )
-    except BudgetError as e:
-        raise UsageError(f"--bytes: {e}") from None
     if best.structure.nodes == 0:
         raise FittingError(
             f"{distances.mesh.path}: the solid is thinner than the cells of {nbytes:,} bytes, "

@@ -3,8 +3,6 @@
 Grids have cubic cells, ``resolution`` of them along the longest side of the field's box.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
 from collections.abc import Callable
@@ -162,16 +160,14 @@ ON_SURFACE = 1e-3
 PARTS = 16
 
 
-def resolution_for(
-    field: DistanceField, error: float, finest: int = MAX_RESOLUTION, seed: int = 0
-) -> tuple[int, float]:
+def resolution_for(field: DistanceField, error: float, finest: int = MAX_RESOLUTION) -> tuple[int, float]:
     """Return the coarsest sufficient grid's cells along the longest side, from 8 to ``finest``, and its mean error.
 
     A grid suffices if its trilinear interpolation differs from the field by at most ``error`` on average on the field's
     surface. If ``finest`` does not suffice, it is returned with its larger error. ``error`` is meant to be the field's
     own (``mae_surface``). Grids are evaluated on the surface only.
     """
-    points = surface_points(field, 2**12, seed)
+    points = surface_points(field, 2**12)
     grid_error = cache(lambda resolution: trilinear_error(field, points, resolution))
     resolutions = range(min(COARSEST, finest), finest)
     index = bisect_left(resolutions, True, key=lambda resolution: grid_error(resolution) <= error)
@@ -198,12 +194,12 @@ def trilinear_error(field: DistanceField, points: np.ndarray, resolution: int) -
     return float(np.mean(np.abs((blend * values).sum(axis=1) - point_values(field, points))))
 
 
-def surface_points(field: DistanceField, count: int, seed: int = 0) -> np.ndarray:
+def surface_points(field: DistanceField, count: int) -> np.ndarray:
     """Return about ``count`` points of the field's surface, ``(N, 3)``, nearly uniform over its area.
 
     Points near the surface are moved onto it by Newton's method along the gradient. Without a surface, N is 0.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     side = float(np.max(np.array(field.upper) - np.array(field.lower))) / PARTS
     blocks = np.ceil((np.array(field.upper) - np.array(field.lower)) / side - 1e-6).astype(int)
     parts = np.argwhere(crossed_blocks(field, np.array(field.lower), side / BLOCK, BLOCK * blocks))

@@ -11,8 +11,6 @@ While nodes are trained, the surface may move anywhere in their cells, so there 
 as in the structure.
 """
 
-from __future__ import annotations
-
 import threading
 from dataclasses import dataclass
 from typing import Any

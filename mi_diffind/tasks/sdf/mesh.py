@@ -4,8 +4,6 @@ All distances, tolerances and points of this task are in that frame; negative is
 Mitsuba's ``.serialized`` and its scenes are read. Repairs that "inside" depends on are listed in :attr:`Mesh.warnings`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib
@@ -349,17 +347,13 @@ def _repair(vertices: np.ndarray, faces: np.ndarray, name: str, repairs: list[st
 
 def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Merge equal vertices and drop unused ones: vertices in lexicographic order, and faces that index them."""
-    used = np.zeros(len(vertices), dtype=bool)
-    used[faces] = True
-    vertices = vertices[used]
-    order = np.lexsort(vertices.T[::-1])
+    used = np.unique(faces)
+    order = used[np.lexsort(vertices[used].T[::-1])]
     ordered = vertices[order]
     first = np.concatenate([[True], np.any(ordered[1:] != ordered[:-1], axis=1)])
-    number = np.empty(len(order), np.int64)
+    number = np.empty(len(vertices), np.int64)
     number[order] = np.cumsum(first) - 1
-    renamed = np.empty(len(used), np.int64)
-    renamed[used] = number
-    return ordered[first], renamed[faces]
+    return ordered[first], number[faces]
 
 
 def edge_balance(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

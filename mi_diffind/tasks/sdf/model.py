@@ -1,7 +1,5 @@
 """Table files of distance fields: their arrays, the fields that they become, and what users do with them."""
 
-from __future__ import annotations
-
 import os
 import time
 from dataclasses import replace
@@ -22,7 +20,7 @@ from ...arrays.tables import (  # fmt: skip
     restored,
 )
 from ...core.compat import backend_module
-from ...core.errors import UsageError
+from ...core.errors import UsageError, raised_as
 from ...core.files import replacing
 from ...core.units import check_memory
 from ...fitting.task import Model
@@ -131,10 +129,8 @@ def read_grid(table: Table) -> SparseGrid:
     structure = SparseGrid(
         tuple(settings["lower"]), float(settings["spacing"]), regions, masks[:, :2], masks[:, 2:], blocks, signs
     )
-    try:
+    with raised_as(TableError, SparseGridError, at=f"{table.path}: is damaged"):
         structure.check()
-    except SparseGridError as e:
-        raise TableError(f"{table.path}: is damaged: {e}") from None
     if bits not in POINTERS or structure.nodes != nodes:
         raise TableError(f"{table.path}: is damaged: its masks have {structure.nodes} nodes, its settings {nodes}")
     words, entries = _words(table, "pointers")[:, 0], len(table.arrays["entries"].entries)

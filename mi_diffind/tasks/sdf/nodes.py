@@ -8,8 +8,6 @@ arrays only; this layout is ours):
 with trilinear weights w, which is exact for quadratic functions. Everywhere else only the sign is known.
 """
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

@@ -5,8 +5,6 @@ mesh; their sides follow those of the box. The preset ``paper`` starts as the su
 distance itself.
 """
 
-from __future__ import annotations
-
 import drjit as dr
 import numpy as np
 from scipy.spatial import cKDTree
@@ -14,7 +12,7 @@ from scipy.spatial import cKDTree
 from ...arrays.budget import Budget, BudgetError, proportional_shape
 from ...arrays.indirection import DifferentiableArray, Indirection, device_array, ramp, rounded, stored_form
 from ...arrays.tables import StoredArray, Table
-from ...core.errors import UsageError
+from ...core.errors import UsageError, raised_as
 from ...fitting.loop import Problem
 from .distances import Distances, sample_box, sample_near
 from .evaluation import HELD_OUT, HeldOut
@@ -96,11 +94,9 @@ def resolutions(nbytes: int, ratio: float, extent) -> tuple[tuple[int, ...], tup
     def shapes(n: int) -> tuple:
         return proportional_shape(n, extent), proportional_shape(n / ratio, extent)
 
-    try:
+    with raised_as(UsageError, BudgetError, at="--bytes"):
         sides = range(4, max(5, nbytes))
         return shapes(Budget(nbytes).largest(lambda n: [((*shapes(n)[0], 3), 8), (shapes(n)[1], 8)], sides))
-    except BudgetError as e:
-        raise UsageError(f"--bytes: {e}") from None
 
 
 def initial(start: str, primary, cascaded, grid_distance, samples, distances, band: float) -> Indirection:
@@ -135,7 +131,8 @@ def slope_bound(net: Indirection, lower, upper, band: float) -> float:
     size = [(b - a) / (n - 1) for a, b, n in zip(lower, upper, pointers.shape, strict=False)]
     last = np.array(values.shape) - 1
     # Cells of the cascaded array that pointers reach: the first along each axis, and how many follow
-    ends = np.stack([np.stack(_ends(pointers[..., c]), axis=-1) * last[c] for c in range(3)], axis=-2)
+    corners = np.lib.stride_tricks.sliding_window_view(pointers, (2, 2, 2), axis=(0, 1, 2))
+    ends = np.stack([end(corners, axis=(-3, -2, -1)) for end in (np.min, np.max)], axis=-1) * last[:, None]
     reach = np.clip(np.floor(ends).astype(int), 0, last[:, None] - 1)
     first, more = reach[..., 0], reach[..., 1] - reach[..., 0]
     cells = np.stack([edge_steps(values, c) * last[c] for c in range(3)], axis=-1)
@@ -156,21 +153,10 @@ def slope_bound(net: Indirection, lower, upper, band: float) -> float:
     return max(1.0, float(2 * band * np.sqrt(square.max())))
 
 
-def _ends(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and the largest of the eight corners of every cell."""
-    sides = slice(None, -1), slice(1, None)
-    corners = [values[sides[a], sides[b], sides[c]] for a in (0, 1) for b in (0, 1) for c in (0, 1)]
-    return np.minimum.reduce(corners), np.maximum.reduce(corners)
-
-
 def edge_steps(values: np.ndarray, axis: int) -> np.ndarray:
     """Return the largest of the four differences along ``axis`` in every cell of a grid of ``values`` (X, Y, Z)."""
-    steps = np.abs(np.diff(values, axis=axis))
-    for other in {0, 1, 2} - {axis}:
-        ahead, behind = [slice(None)] * 3, [slice(None)] * 3
-        ahead[other], behind[other] = slice(1, None), slice(None, -1)
-        steps = np.maximum(steps[tuple(ahead)], steps[tuple(behind)])
-    return steps
+    steps, others = np.abs(np.diff(values, axis=axis)), tuple({0, 1, 2} - {axis})
+    return np.lib.stride_tricks.sliding_window_view(steps, (2, 2), axis=others).max(axis=(-2, -1))
 
 
 class PairProblem(Problem):

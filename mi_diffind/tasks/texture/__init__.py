@@ -7,8 +7,6 @@ keeps; :mod:`.surface`: maps as parameters of the BRDF, and shading; :mod:`.appe
 measure, and a preview; :mod:`.fit`: the command ``fit texture``.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -127,13 +125,13 @@ class FineArray(NamedTuple):
     bits: int
 
 
-def parse_structure(text: str) -> tuple[FineArray, ...]:
-    """Return the fine arrays of a text such as ``0:1:2,1:2:4`` (level, channels, bits), none for auto and pages.
+def parse_structure(text: str) -> str | tuple[FineArray, ...]:
+    """Return ``"auto"``, ``"pages"``, or the fine arrays of a text such as ``0:1:2,1:2:4`` (level, channels, bits).
 
     Raises ``ValueError``.
     """
     if text in ("auto", "pages"):
-        return ()
+        return text
     if not re.fullmatch(r"\d+:\d+:\d+(,\d+:\d+:\d+)*", text, re.ASCII):
         raise ValueError(f'structure: found {text!r}, allowed are LEVEL:CHANNELS:BITS,… as in 0:1:2,1:2:4, and "auto"')
     fine = tuple(FineArray(*map(int, part.split(":"))) for part in text.split(","))

@@ -10,8 +10,6 @@ and their mean is the reference. Three patterns of samples:
 - ``"jittered"``: 16 random samples of unfiltered maps, one in each of 4 × 4 strata: noisy, yet right on average.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -67,9 +65,7 @@ class ShadedEvaluation:
     References are ``truths[letter][level]``, ``(pairs, rows, columns, 3)``, linear.
     """
 
-    def __init__(
-        self, pyramid: Pyramid, effects: Effects, levels: int = 6, pairs: int = 16, side: int = 64, truths="CP"
-    ):  # fmt: skip
+    def __init__(self, pyramid: Pyramid, effects: Effects, levels: int = 6, pairs: int = 16, side: int = 64):
         self.pyramid, self.effects, self.types = pyramid, effects, pyramid.types
         self.levels = min(levels, pyramid.levels)
         rng = np.random.default_rng(SEED)
@@ -84,7 +80,7 @@ class ShadedEvaluation:
         spare = np.array(sizes) - np.array(self.sizes)
         shifts = rng.random((self.levels, pairs, 2))
         self.origins = np.floor(rng.random(shifts.shape) * (spare[:, None] + 1)).clip(0, spare[:, None]) + shifts
-        self.truths = {letter: [self._truth(TRUTHS[letter], i) for i in range(self.levels)] for letter in truths}
+        self.truths = {k: [self._truth(pattern, i) for i in range(self.levels)] for k, pattern in TRUTHS.items()}
 
     def _lanes(self, level: int, pairs=None) -> tuple:
         """Return ``(u, v, level, wi, wo)`` of all pixels of the images of a level, and their shape."""
@@ -237,7 +233,7 @@ def write_preview(path: Path, evaluation: ShadedEvaluation, read: ShadedReader) 
     """
     import mitsuba as mi
 
-    truths = evaluation.truths[next(iter(evaluation.truths))]
+    truths = evaluation.truths["C"]
     pair = int(np.abs(np.clip(truths[0], 0, 1).mean(axis=(1, 2, 3)) - BRIGHTNESS).argmin())
     rows, side = [], max(PANEL, *(max(size) for size in evaluation.sizes))
     for level in (i for i in LEVELS if i < evaluation.levels):

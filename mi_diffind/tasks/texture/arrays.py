@@ -8,8 +8,6 @@
   levels, so at step 0 they are smaller pictures of fewer channels.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -414,8 +412,9 @@ def from_components(
     def pointer(level: np.ndarray) -> np.ndarray:
         unit = MARGIN + (1 - 2 * MARGIN) * (((level - mean) @ directions.T - low) / (high - low))
         # A texture has at most as many components as channels: further coordinates start as ramps along u or v
-        further = _ramps(*level.shape[:2], size.dims - used)
-        return np.concatenate([np.clip(unit, 0, 1).astype(np.float32), further], axis=-1)
+        u, v = np.meshgrid(*((np.arange(n) + 0.5) / n for n in level.shape[1::-1]))
+        further = [(u, v)[i % 2][..., None] for i in range(size.dims - used)]
+        return np.concatenate([np.clip(unit, 0, 1).astype(np.float32), *further], axis=-1, dtype=np.float64)
 
     pointers = [pointer(level) for level in values]
     reached, level = pointers[size.skip], size.skip
@@ -478,9 +477,3 @@ def _pages(pointers: list, ranges: np.ndarray, size: TextureBudget, border) -> t
         layers.append(FineLayer(level, end - 1, size.page_bits, (1.0,) * size.dims, True))
         fine.append(PagedArray(sizes, size.dims, entries, shift, fold=True, border=border))
     return layers, fine
-
-
-def _ramps(rows: int, columns: int, count: int) -> np.ndarray:
-    """Return the positions of texel centres, ``(rows, columns, count)``: along u and v in turn."""
-    v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
-    return np.concatenate([np.zeros((rows, columns, 0)), *[(u, v)[i % 2][..., None] for i in range(count)]], axis=-1)

@@ -54,21 +54,6 @@ def footprints(u, distribution: str, base: int):
     return dr.minimum(-dr.log(dr.maximum(u, 1e-30)) / exponential_rate(base), 1)
 
 
-def share_below(x: np.ndarray, distribution: str, base: int) -> np.ndarray:
-    """Return the fraction of footprints below ``x`` in [0, 1): ``x^(1/n)`` or ``1 − e^(−λ_e x)`` (equations 5, 8)."""
-    return x ** (1 / exponent(base)) if distribution == "power" else 1 - np.exp(-exponential_rate(base) * x)
-
-
-def footprint_histogram(distribution: str, levels: int) -> np.ndarray:
-    """Return the share of footprints that is nearest to each of ``levels`` levels of detail.
-
-    The texture has the side 2^(levels − 1). Shape ``(levels,)``; the shares sum to 1.
-    """
-    between = 2.0 ** (np.arange(levels - 1) + 0.5 - (levels - 1))
-    below = share_below(between, distribution, 2 ** (levels - 1))
-    return np.diff(np.concatenate([[0.0], below, [1.0]]))
-
-
 def footprint_level(x, levels: int):
     """Return the level of detail in [0, levels − 1] of a footprint in [0, 1]."""
     return dr.maximum(dr.log2(dr.maximum(x, 1e-30)) + (levels - 1), 0)

@@ -1,7 +1,5 @@
 """``fit texture``: checks of options, the choice of a memory budget, and a training of one or two stages."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping
@@ -9,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ...arrays.tables import MAX_BYTES, Table
-from ...core.errors import UsageError
+from ...core.errors import UsageError, raised_as
 from ...core.progress import interruptible
 from ...core.units import figure_lines
 from ...fitting.task import FitRequest, FitResult, Fitted
@@ -18,11 +16,11 @@ from ...maps.model import complete, load_maps, preview_path, rehearse_pictures, 
 from ...maps.pyramid import Pyramid
 from ...maps.search import check_psnr, search_by_psnr, search_lines
 from ...maps.source import Source
-from . import PRESETS, TASK, ShadingSettings, TextureSettings, arrays, parse_structure
+from . import PRESETS, TASK, ShadingSettings, TextureSettings, arrays
 from .appearance import ShadedEvaluation
 from .arrays import PaperBudget, TextureBudget
 from .compressed import CompressedTexture, neutral_extras, read_level_bias
-from .shading import fit_shading, trainable_arrays
+from .shading import ShadingTraining, trainable_arrays
 from .surface import left_out, maps_of, material_effects, varies_shading
 from .training import TextureProblem, build_problem, channel_weights, fit_texture, source_layout
 
@@ -183,10 +181,8 @@ def fit_stages(request: FitRequest, source: Source, pyramid: Pyramid) -> tuple[F
             lines = ["not trained for its shading: interrupted"]
             return Fitted(table, dataclasses.replace(result, interrupted=True), lines), requested, room
         lines += [f"the training for its maps: {result.outcome}"] * result.unfinished
-    try:
+    with raised_as(UsageError, ValueError):
         net = trainable_arrays(table, pyramid)
-    except ValueError as e:
-        raise UsageError(str(e)) from None
     nbytes = table.nbytes
 
     def build(weights: Mapping[str, float]) -> TextureProblem:
@@ -194,10 +190,12 @@ def fit_stages(request: FitRequest, source: Source, pyramid: Pyramid) -> tuple[F
         size = find_size(source, pyramid, nbytes, request.settings, options, scale)
         return build_problem(source, size, request.settings, pyramid, weights)
 
-    table, result = fit_shading(
-        source, net, recipe, last_request(request), pyramid, evaluation, preview_path(request),
+    if request.checkpoint is not None:  # those of the last stage are in CHECKPOINT.shading.…
+        request = dataclasses.replace(request, checkpoint=f"{request.checkpoint}.shading")
+    table, result = ShadingTraining(
+        source, net, recipe, request, pyramid, evaluation, preview_path(request),
         read_level_bias(table.settings), build if request.settings.layered else None,
-    )  # fmt: skip
+    ).fit()  # fmt: skip
     fitted = Fitted(table, result, *shading_report(table, layout))
     fitted.lines[:0] = lines
     return fitted, requested, room * ("extras" not in table.arrays)
@@ -213,13 +211,6 @@ def load_start(path, source: Source, request: FitRequest) -> Table:
         preset = next(name for name, recipe in PRESETS.items() if recipe.layered == layered)
         raise UsageError(f"--start: found arrays of the preset {preset}, {request.preset} is needed")
     return table
-
-
-def last_request(request: FitRequest) -> FitRequest:
-    """Return the request for the last stage, whose trainings keep their checkpoints in ``CHECKPOINT.shading.…``."""
-    if request.checkpoint is None:
-        return request
-    return dataclasses.replace(request, checkpoint=f"{request.checkpoint}.shading")
 
 
 def room_for_extras(recipe: ShadingSettings, pyramid: Pyramid, nbytes: float) -> tuple[ShadingSettings, int]:
@@ -261,8 +252,7 @@ def find_size(source: Source, pyramid: Pyramid, nbytes: float, recipe: TextureSe
     ``scale`` are factors of the channels, ``(channels,)``, by which their errors count.
     """
     if recipe.layered:
-        structure = options["structure"] or "auto"
-        size = _layered_size(pyramid, nbytes, structure, options["skip"], options["cascaded"], scale)
+        size = _layered_size(pyramid, nbytes, options["structure"], options["skip"], options["cascaded"], scale)
     else:
         shape = pyramid.values[0].shape
         size = arrays.paper_size(nbytes, source.nbytes, shape[2], *shape[:2], options["ratio"])
@@ -271,16 +261,9 @@ def find_size(source: Source, pyramid: Pyramid, nbytes: float, recipe: TextureSe
     return size
 
 
-def _page_gain(pyramid: Pyramid, size: TextureBudget, scale=1.0) -> float:
-    """Return the gain of pages over one grid of equal bytes at level 0, in dB."""
-    return gain_of_pages((pyramid.values[0] * scale).astype(np.float32), size.dims, size.page_entries, pyramid.border)[
-        0
-    ]
-
-
-def _layered_size(pyramid: Pyramid, nbytes: float, structure: str, skip: int | None, cascaded: int | None, scale=1.0):
+def _layered_size(pyramid: Pyramid, nbytes: float, structure, skip: int | None, cascaded: int | None, scale=1.0):
     """Return the budget of pages or fine arrays: those of a ``structure``, or the best for the texture."""
-    shape, fine = pyramid.values[0].shape, parse_structure(structure) or None
+    shape, fine = pyramid.values[0].shape, structure if isinstance(structure, tuple) else None
     if fine is not None:
         skip = fine[-1].level + 1 if skip is None else skip
         if skip <= fine[-1].level:
@@ -291,9 +274,10 @@ def _layered_size(pyramid: Pyramid, nbytes: float, structure: str, skip: int | N
         size = arrays.paged(*shape, nbytes, cascaded)
         if size is None and structure == "pages":
             raise UsageError("--structure: found pages, for which the texture or its bytes are too small or too large")
-        if size is not None and (structure == "pages" or _page_gain(pyramid, size, scale) >= GAIN_DB):
+        finest = (pyramid.values[0] * scale).astype(np.float32)
+        if size is not None and (
+            structure == "pages" or gain_of_pages(finest, size.dims, size.page_entries, pyramid.border)[0] >= GAIN_DB
+        ):
             return size
-    try:
+    with raised_as(UsageError, ValueError, at="--structure"):
         return arrays.choose(*shape, nbytes, skip, fine, cascaded, arrays.ladder(smoothness(pyramid.values[0])))
-    except ValueError as e:
-        raise UsageError(f"--structure: {e}") from None

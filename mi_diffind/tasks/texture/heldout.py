@@ -7,9 +7,8 @@ is lost where pixels are stretched along v alone. Differences of two readers hav
 decides nothing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
@@ -137,6 +136,9 @@ class HeldOutFootprints:
         self.pyramid, self.types, self.count = pyramid, pyramid.types, count
         self.levels = min(LEVELS, pyramid.levels)
         rng, types = np.random.default_rng(seed), self.types
+        numbers_of_numpy = SimpleNamespace(
+            random=lambda dtype, size: dtype(aligned_copy(rng.random(size, dtype=np.float32)))
+        )
         self.footprints = []
         for level in range(self.levels):
             # Pairs of a group are neighbours; groups of uniform lights come first, those of a sky last
@@ -150,7 +152,7 @@ class HeldOutFootprints:
             stretch, *views = stretched_views(types, stretch, a, b)
             wi, wo, weight = mirrored_pairs(types, [*views, *lights])
             at = at + level
-            truth = reference("jittered", pyramid, u, v, at, wi, wo, effects, _Numbers(rng), SIDE, stretch)
+            truth = reference("jittered", pyramid, u, v, at, wi, wo, effects, numbers_of_numpy, SIDE, stretch)
             dr.eval(u, v, at, stretch, wi, wo, weight, truth)
             self.footprints.append((u, v, at, stretch, wi, wo, weight, truth))
         lit = [(w * sum(truth) / 3).numpy().reshape(LIGHTS, -1, SKY) for *_, w, truth in self.footprints]
@@ -228,17 +230,6 @@ class HeldOutFootprints:
             value = read(u, v, finer, wi, wo, share_of_bias(stretch))
             dr.eval(value)
             return value
-
-
-class _Numbers:
-    """Generator of arrays of uniform numbers, as the reference draws them, from NumPy's."""
-
-    def __init__(self, rng: np.random.Generator):
-        self.rng = rng
-
-    def random(self, dtype, size: int):
-        """Return ``size`` uniform numbers."""
-        return dtype(aligned_copy(self.rng.random(size, dtype=np.float32)))
 
 
 def compared(base: list[list[np.ndarray]], errors: list[list[np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:

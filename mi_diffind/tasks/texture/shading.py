@@ -8,8 +8,6 @@
 - **Choice.** Held-out footprints (:mod:`.heldout`) decide which arrays are kept, and at which level bias they are read.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Iterator
@@ -24,8 +22,7 @@ from ...arrays.indirection import aligned_copy, device_array, unfolded
 from ...arrays.tables import Table
 from ...core.progress import interruptible
 from ...fitting.loop import FitResult, all_cores, sample_losses
-from ...fitting.task import FitRequest, FitSettings, Stage
-from ...maps.model import significant
+from ...fitting.task import FitRequest, FitSettings, Stage, significant
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
 from ..disney.decoder import Decoder
@@ -217,7 +214,10 @@ class ShadingProblem(textures.TextureProblem):
             value = [dr.block_reduce(dr.ReduceOp.Add, c, reads) / reads for c in value]
         if recipe.skies:
             value, truth = ([mean_of_skies(sky, c) for c in x] for x in (value, truth))
-        bounded = _bounded if recipe.bounded else (lambda x: x)
+
+        def bounded(x):  # logarithmic above 1: a rare highlight cannot dominate the loss
+            return dr.select(x > 1, 1 + dr.log(dr.maximum(x, 1)), x) if recipe.bounded else x
+
         errors = [bounded(a * exposure) - bounded(b * exposure) for a, b in zip(value, truth, strict=True)]
         squared = self.settings.loss == "mse"
         return reads * weight * sum(dr.square(e) if squared else dr.abs(e) for e in errors) / 3
@@ -241,11 +241,6 @@ class ShadingProblem(textures.TextureProblem):
         return {"gain_db": float(gain), **{f"texture_{name}": value for name, value in texture.items()}}
 
 
-def _bounded(x):
-    """Return values up to 1 unchanged, and ``1 + log x`` above: a rare highlight cannot dominate the loss."""
-    return dr.select(x > 1, 1 + dr.log(dr.maximum(x, 1)), x)
-
-
 def trainable_arrays(table: Table, pyramid: Pyramid):
     """Return the arrays of a trained texture for further training. Raises ``ValueError`` for other channels."""
     texture = CompressedTexture.from_table(table, pyramid.types.TensorXf, "float32")
@@ -266,67 +261,61 @@ class TrainedState(NamedTuple):
     mean: float
 
 
-def fit_shading(
-    source: Source,
-    start,
-    recipe: ShadingSettings,
-    request: FitRequest,
-    pyramid: Pyramid,
-    evaluation: ShadedEvaluation | None = None,
-    preview: Path | None = None,
-    start_bias: float = 0.0,
-    build: Callable[[dict[str, float]], textures.TextureProblem] | None = None,
-) -> tuple[Table, FitResult]:
-    """Train arrays (``start``: :func:`trainable_arrays`) of ``source`` for shading; return the table and its record.
-
-    The table is of the task ``texture``, with its errors as a texture and as shaded images of the ``evaluation``.
-    ``build(weights)`` returns the problem of training arrays of the same bytes anew for weighted maps (``None``: that
-    is not tried). Held-out footprints choose state and level bias. If no state gains without a loss somewhere, the
-    table holds the start, read with its ``start_bias`` (setting ``kept_start``). The setting ``before`` has the errors
-    of the start as shaded images, ``states`` the gains of all states. ``preview`` is a picture that is written at each
-    measurement.
-    """
-    training = ShadingTraining(start, recipe, request, pyramid, evaluation, preview, start_bias, build, source.digest)
-    result, best, kept = training.run()
-    identity = {"source": source.digest, **TEXTURES[recipe.texture].further, "shading": recipe.further}
-    gains = {state.name: round(state.gain, 3) for state in training.states}
-    recorded = dataclasses.replace(request, settings=recipe).recorded(result)
-    settings = {**recorded, **identity, "level_bias": best.texture.level_bias, "state": best.name}
-    settings |= {"states": gains, **({"kept_start": True} if kept else {})}
-    table = to_table(best.texture, settings)
-    table.preset, table.seed = request.preset, recipe.seed
-    texture = CompressedTexture.from_table(table, request.types.TensorXf)
-    table.settings["before"] = significant(training.before)
-    after = training.before if kept else training.errors(texture)
-    table.measured = significant({**after, **texture.measure(source)})
-    return table, result
-
-
+@dataclasses.dataclass
 class ShadingTraining:
-    """Trainings for shading, one after the other, and the ``states`` among which held-out footprints choose.
+    """Trainings of arrays of ``source`` for shading, and the ``states`` among which held-out footprints choose.
 
-    Parameters are those of :func:`fit_shading`; ``digest`` is that of the source.
+    ``start`` are the :func:`trainable_arrays` of a texture, read with its level bias ``start_bias``. ``build(weights)``
+    returns the problem of training arrays of the same bytes anew for weighted maps (``None``: that is not tried).
+    ``preview`` is a picture of the ``evaluation`` that is written at each measurement.
     """
 
-    def __init__(
-        self, start, recipe: ShadingSettings, request: FitRequest, pyramid: Pyramid,
-        evaluation: ShadedEvaluation | None, preview: Path | None, start_bias: float, build, digest: str,
-    ):  # fmt: skip
-        self.start, self.recipe, self.request, self.pyramid = start, recipe, request, pyramid
-        self.evaluation, self.preview, self.build, self.digest = evaluation, preview, build, digest
-        self.effects, self.layout = material_effects(pyramid.layout)[0], pyramid.layout
-        self.first = CompressedTexture(self.layout, textures.stored_form(start), start_bias)
-        bias = recipe.level_bias
+    source: Source
+    start: object
+    recipe: ShadingSettings
+    request: FitRequest
+    pyramid: Pyramid
+    evaluation: ShadedEvaluation
+    preview: Path | None = None
+    start_bias: float = 0.0
+    build: Callable[[dict[str, float]], textures.TextureProblem] | None = None
+
+    def __post_init__(self):
+        self.effects, self.layout = material_effects(self.pyramid.layout)[0], self.pyramid.layout
+        self.first = CompressedTexture(self.layout, textures.stored_form(self.start), self.start_bias)
+        bias = self.recipe.level_bias
         self.biases = BIASES if bias is None else (bias,)
         # Every fourth one if time is limited: comparisons take it from trainings
-        self.ways = WAYS if request.deadline is None else WAYS[3::4]
+        self.ways = WAYS if self.request.deadline is None else WAYS[3::4]
         self.trained_bias = TRAINED_BIAS if bias is None else bias
         self.states, self.begin = [TrainedState("start", self.first, 0.0, 0.0)], []
         #: Name, first arrays and problem of the training in progress, which Ctrl-C may end
         self.in_progress: tuple | None = None
 
-    def run(self) -> tuple[FitResult, TrainedState, bool]:
-        """Carry out all trainings; return the record, the best state, and whether that is the start."""
+    def fit(self) -> tuple[Table, FitResult]:
+        """Train, and return the table with the errors as a texture and as shaded images, and its record.
+
+        If no state gains without a loss somewhere, the table holds the start (setting ``kept_start``). The setting
+        ``before`` has the errors of the start as shaded images, ``states`` the gains of all states.
+        """
+        recipe, request, source = self.recipe, self.request, self.source
+        result, best = self.run()
+        kept = best is self.states[0]
+        identity = {"source": source.digest, **TEXTURES[recipe.texture].further, "shading": recipe.further}
+        gains = {state.name: round(state.gain, 3) for state in self.states}
+        recorded = dataclasses.replace(request, settings=recipe).recorded(result)
+        settings = {**recorded, **identity, "level_bias": best.texture.level_bias, "state": best.name}
+        settings |= {"states": gains, **({"kept_start": True} if kept else {})}
+        table = to_table(best.texture, settings)
+        table.preset, table.seed = request.preset, recipe.seed
+        texture = CompressedTexture.from_table(table, request.types.TensorXf)
+        table.settings["before"] = significant(self.before)
+        after = self.before if kept else self.errors(texture)
+        table.measured = significant({**after, **texture.measure(source)})
+        return table, result
+
+    def run(self) -> tuple[FitResult, TrainedState]:
+        """Carry out all trainings; return the record and the best state."""
         with interruptible() as self.stop:
             self.held_out = HeldOutFootprints(self.pyramid, self.effects)
             count = len(self.biases) * len(self.ways)
@@ -341,7 +330,7 @@ class ShadingTraining:
             result, measured={"gain_db": best.mean}, step=result.step * best.name.startswith("appearance"),
             history=[figures for figures in result.history if "gain_db" in figures],
         )  # fmt: skip
-        return result, best, best is self.states[0]
+        return result, best
 
     def stages(self) -> Iterator[Stage]:
         """Yield the trainings: short ones for weights, the one for weighted maps, and the one for appearance."""
@@ -388,9 +377,8 @@ class ShadingTraining:
         return self.held_out.errors(reader(texture, self.effects))
 
     def errors(self, texture: CompressedTexture) -> dict[str, float]:
-        """Return the errors of shaded images, ``shaded_TRUTH_db``; none without an evaluation."""
-        evaluation = self.evaluation
-        measured = {} if evaluation is None else evaluation.measure(reader(texture, self.effects), False)
+        """Return the errors of shaded images, ``shaded_TRUTH_db``."""
+        measured = self.evaluation.measure(reader(texture, self.effects), flip=False)
         return {f"shaded_{TRUTHS[k]}_db": f["mean_db"] for k, f in measured.items()}
 
     def add(self, name: str, net) -> None:
@@ -416,8 +404,8 @@ class ShadingTraining:
         if recipe.extras and net.extras is None:
             net.extras = neutral_extras(layout.height, layout.width, net.border).alloc(types.TensorXf)
         changed = dataclasses.replace(recipe, level_bias=self.trained_bias)
-        problem = ShadingProblem(net, self.pyramid, changed, self.digest, self.held_out, self.base)
-        problem.preview = None if None in (self.preview, self.evaluation) else (self.preview, self.evaluation)
+        problem = ShadingProblem(net, self.pyramid, changed, self.source.digest, self.held_out, self.base)
+        problem.preview = self.preview and (self.preview, self.evaluation)
         return problem
 
 

@@ -9,8 +9,6 @@ Maps are known by their role: albedo, normal, roughness, metallic. A missing par
 ``disney``. Ambient occlusion and other maps are not shaded, since ``disney`` and ``principled`` have no such parameter.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Training of task 4: arrays of a texture, trained for the values of its channels at every level of detail."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 

@@ -9,6 +9,7 @@ from arrays import aligned, numpy_of
 from mi_diffind.arrays.tables import StoredArray, TableError, load_table, save_table
 from mi_diffind.core.runtime import array_module
 from mi_diffind.fitting.task import FitRequest
+from mi_diffind.maps.layout import gain_of_pages
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.tasks.texture import PRESETS, TASK, arrays, fit, training
@@ -130,7 +131,8 @@ def test_which_textures_get_pages():
     noise = np.random.default_rng(4).integers(0, 256, (64, 64, 3), np.uint8)
     for maps, more in ((source, True), (from_arrays({"albedo": noise}), False)):
         pyramid = Pyramid.from_source(maps, training.source_layout(maps, recipe()), TYPES, ("repeat", "clamp"))
-        gain = fit._page_gain(pyramid, paged(maps))
+        size = paged(maps)
+        gain, _ = gain_of_pages(np.float32(pyramid.values[0]), size.dims, size.page_entries, pyramid.border)
         assert (gain >= fit.GAIN_DB) == more, gain
     assert arrays.paged(8, 8, 3, 100) is None and arrays.paged(1024, 1024, 3, 20000) is None
     assert arrays.paged(512, 512, 3, 65536).nbytes <= 65536

@@ -32,7 +32,7 @@ from mi_diffind.tasks.texture import PRESETS as TEXTURES
 from mi_diffind.tasks.texture import SHADING_PRESETS as PRESETS
 from mi_diffind.tasks.texture import TASK as TEXTURE
 from mi_diffind.tasks.texture import fit as texture_fit
-from mi_diffind.tasks.texture import heldout
+from mi_diffind.tasks.texture import heldout, parse_structure
 from mi_diffind.tasks.texture import shading as training
 from mi_diffind.tasks.texture import surface as material
 from mi_diffind.tasks.texture import training as textures
@@ -243,7 +243,9 @@ def start(ad, tmp_path_factory):
     source, pyramid = pyramid_of(bumpy(), ad)
     recipe = TEXTURES["ours"]
     recipe = dataclasses.replace(recipe, steps=60, batch=4096, measure_every=60)
-    options = {argument.name: argument.default for argument in TEXTURE.arguments} | {"structure": "0:1:2,1:2:4"}
+    options = {argument.name: argument.default for argument in TEXTURE.arguments} | {
+        "structure": parse_structure("0:1:2,1:2:4")
+    }
     options["skip"] = 2
     size = texture_fit.find_size(source, pyramid, source.nbytes / 2, recipe, options)
     request = FitRequest("ours", recipe, ad, progress=False)
@@ -278,10 +280,10 @@ def unseen(monkeypatch):
 def trained(start, ad, recipe, measured=True, **request):
     """The table of the last stage without trainings for weighted maps, and its record."""
     source, pyramid, table, evaluation, *_ = start
-    evaluation = evaluation if measured else None
+    evaluation = evaluation if measured else SimpleNamespace(measure=lambda read, flip: {})
     net = training.trainable_arrays(table, pyramid)
     asked = FitRequest("ours", recipe, ad, progress=False, **request)
-    return training.fit_shading(source, net, recipe, asked, pyramid, evaluation)
+    return training.ShadingTraining(source, net, recipe, asked, pyramid, evaluation).fit()
 
 
 def test_training_for_shading_gains(start, ad):
