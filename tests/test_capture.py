@@ -1,12 +1,12 @@
 """``mi-diffind capture``: where the cameras are, what their images show, and going on with a folder."""
 
 import json
-import signal
 from pathlib import Path
 
 import captures
 import numpy as np
 import pytest
+from commands import interrupt_at
 from PIL import Image
 
 from mi_diffind.commands import cli
@@ -131,16 +131,8 @@ def test_other_settings_are_refused(mi_rgb, scene, tmp_path, capsys):
 
 
 def test_an_interrupted_capture_is_gone_on_with(mi_rgb, scene, tmp_path, monkeypatch, capsys):
-    render, calls = capture.SceneSubject.render, []
-
-    def third(self, *arguments):
-        calls.append(1)
-        if len(calls) == 3:
-            signal.raise_signal(signal.SIGINT)
-        return render(self, *arguments)
-
     with monkeypatch.context() as patch:
-        patch.setattr(capture.SceneSubject, "render", third)
+        interrupt_at(patch, capture.SceneSubject, "render", 3)
         assert run(scene, tmp_path / "views") == 130
     assert "3 of 6 views, 3 rendered now" in capsys.readouterr().out
     assert len(load_views(tmp_path / "views")) == 3  # what there is can be used

@@ -2,7 +2,6 @@
 
 import json
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from commands import refused
+from commands import interrupt_at, refused
 
 from mi_diffind.arrays.tables import load_table
 from mi_diffind.commands.cli import VERBS, main
@@ -94,58 +93,16 @@ def test_inspect_tables(tmp_path, capsys):
     assert sum(a["bytes"] for a in found["arrays"].values()) == found["bytes"]
 
 
-def test_inspect_measures(tmp_path, capsys, few_samples):
-    """Each storage form; the tests of the models are those that measure at as many places as a user has."""
-    report = tmp_path / "report.json"
-    assert main(["inspect", str(shipped("disney")), "--measure", "--json", str(report)]) == 0
-    text = capsys.readouterr().out
-    assert f"as uint8: {entries('disney')} bytes (" in text
-    measured = json.loads(report.read_text())["measured_in_each_form"]
-    for storage, size in (("float32", 4), ("float16", 2), ("uint8", 1)):
-        found = measured[storage]
-        assert found["bytes"] == size * entries("disney") <= found["memory_bytes"] < 20_000
-        assert min(found[f"psnr{kind}_db"] for kind in ("", "_uniform")) > 76
-        assert min(found[f"psnr_brdf{kind}_db"] for kind in ("", "_uniform")) > 70
-        assert f"PSNR               {found['psnr_db']:.2f} dB" in text
-    assert measured["float32"]["psnr_db"] > 86
-
-
 #: Enough steps to see that it trains.
 FIT = ["--steps", "10", "--batch", "2048", "--variant", "llvm_ad_rgb"]
-
-
-def test_fit(tmp_path, capsys, few_samples):
-    """Twice, with ``--json`` before and after the task: the same bytes."""
-    out, report = tmp_path / "own.npz", tmp_path / "report.json"
-    options = [*FIT, "--storage", "float16", "-o"]
-    assert main(["fit", "disney", *options, str(out), "--json", str(report)]) == 0
-    found, table = json.loads(report.read_text()), load_table(out)
-    assert found["bytes"] == 2 * entries("disney") and found["settings"]["steps"] == 10
-    assert found["measured"]["psnr_db"] > 60
-    assert found["task"] == table.task == "disney" and found["preset"] == table.preset == "tables"
-    assert found["measured"] == table.measured and found["storage"] == table.storage == "float16"
-    assert f"{out}: {found['bytes']:,} bytes as float16; best step " in capsys.readouterr().out
-    assert [h["step"] for h in found["history"]] == [10] and not found["interrupted"]
-    again = tmp_path / "again.npz"
-    assert main(["fit", "--json", str(tmp_path / "before.json"), "disney", *options, str(again)]) == 0
-    assert out.read_bytes() == again.read_bytes()
-    assert json.loads((tmp_path / "before.json").read_text())["bytes"] == found["bytes"]
 
 
 def test_an_interrupted_fit_keeps_the_best(tmp_path, capsys, few_samples, monkeypatch):
     """Ctrl-C; ``tests/trust/test_kills.py`` and ``tests/tasks/sdf`` go on with one."""
     out, report = tmp_path / "own.npz", tmp_path / "report.json"
-    original, calls = GGXProblem.batch, []
-
-    def batch(self, rng, size):
-        calls.append(size)
-        if len(calls) == 259:
-            signal.raise_signal(signal.SIGINT)
-        return original(self, rng, size)
-
-    monkeypatch.setattr(GGXProblem, "batch", batch)
-    command = ["fit", "ggx", "--steps", "500", "--batch", "512", "--variant", "llvm_ad_rgb"]
-    assert main([*command, "-o", str(out), "--json", str(report)]) == 130
+    interrupt_at(monkeypatch, GGXProblem, "batch", 259)
+    command = ["fit", "--json", str(report), "ggx", "--steps", "500", "--batch", "512", "--variant", "llvm_ad_rgb"]
+    assert main([*command, "-o", str(out)]) == 130
     text, found = capsys.readouterr(), json.loads(report.read_text())
     assert "interrupted at step 259, kept step " in text.out and "stopping after this step" in text.err
     assert found["interrupted"] and out.exists() and "NaN" not in report.read_text()
@@ -154,15 +111,7 @@ def test_an_interrupted_fit_keeps_the_best(tmp_path, capsys, few_samples, monkey
 
 def test_interrupted_renders_keep_what_they_have(mi_rgb, tmp_path, monkeypatch, capsys):
     """Ctrl-C in the second pass of each command."""
-    render, passes = mi_rgb.render, []
-
-    def interrupting(*arguments, **options):
-        passes.append(1)
-        if len(passes) == 2:
-            os.kill(os.getpid(), signal.SIGINT)
-        return render(*arguments, **options)
-
-    monkeypatch.setattr(mi_rgb, "render", interrupting)
+    passes = interrupt_at(monkeypatch, mi_rgb, "render", 2)
     out, report, folder = tmp_path / "image.exr", tmp_path / "report.json", tmp_path / "pictures"
     scene, variant = scene_file(tmp_path), ["--variant", mi_rgb.variant()]
     assert main(["render", scene, "-o", str(out), "--json", str(report), "--spp", "96", *variant]) == 130
@@ -263,15 +212,11 @@ def test_bad_options(tmp_path, capsys):
         ("scalar_rgb", 'does not run in the variant "scalar_rgb"; use one of'),
     ):
         assert fault in refused(capsys, "render", path, "--variant", name)
-    with pytest.raises(SystemExit) as caught:
-        main(["render", path, "-D", "width"])
-    assert caught.value.code == 2 and "expected NAME=VALUE" in capsys.readouterr().err
+    assert "expected NAME=VALUE" in refused(capsys, "render", path, "-D", "width")
     assert "nothing" in refused(capsys, "render", path, "-D", "nothing=1")
     assert "allowed are .exr and .png" in refused(capsys, "render", path, "-o", str(tmp_path / "image.tiff"))
     for arguments in (["render", path, "--spp", "0"], ["nothing"], []):
-        with pytest.raises(SystemExit) as caught:
-            main(arguments)
-        assert caught.value.code == 2
+        refused(capsys, *arguments)
 
 
 def test_bad_tasks(capsys):
@@ -285,9 +230,7 @@ def test_bad_tasks(capsys):
         (["fit", "disney", "-o", "t.npz", "--primary", "8"], "unrecognized arguments: --primary 8"),
         (["fit", "ggx", "-o", "t.npz", "--primary", "1"], "--primary: found 1, allowed are 2 to 4096 entries a side"),
     ):
-        with pytest.raises(SystemExit) as caught:
-            main(arguments)
-        assert caught.value.code == 2 and sentence in capsys.readouterr().err
+        assert sentence in refused(capsys, *arguments)
 
 
 def test_checkpoints_replace_nothing_else(tmp_path, capsys, few_samples):

@@ -1,14 +1,12 @@
 """The share of each bounce, and the depth that is chosen from it."""
 
 import json
-import os
-import signal
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from commands import refused
+from commands import interrupt_at, refused
 
 from mi_diffind.commands.cli import main
 from mi_diffind.scenes import depth, loading
@@ -220,20 +218,12 @@ def test_bad_options(tmp_path, capsys):
     tolerances = [["--depth", "auto", f"--depth-tolerance={value}"] for value in values]
     for options, allowed in ((depths, "allowed are auto, scene"), (tolerances, "numbers above 0 and below 1")):
         for option in options:
-            with pytest.raises(SystemExit) as caught:
-                main(["render", file, *option])
-            assert caught.value.code == 2 and allowed in capsys.readouterr().err
+            assert allowed in refused(capsys, "render", file, *option)
 
 
 def test_interrupted_probe(tmp_path, monkeypatch, capsys):
     """Ctrl-C while the probe runs: nothing to keep, exit code 130."""
-    original = depth.probe
-
-    def interrupted(*arguments, **options):
-        os.kill(os.getpid(), signal.SIGINT)
-        return original(*arguments, **options)
-
-    monkeypatch.setattr(depth, "probe", interrupted)
+    interrupt_at(monkeypatch, depth, "probe")
     out = tmp_path / "image.exr"
     assert main(["render", scene_file(tmp_path, CONVEX), "-o", str(out), "--depth", "auto"]) == 130
     assert "mi-diffind: interrupted" in capsys.readouterr().err and not out.exists()

@@ -3,14 +3,13 @@
 import dataclasses
 import json
 import os
-import signal
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import OpenEXR
 import pytest
-from commands import refused
+from commands import interrupt_at, refused
 from variants import set_variant
 
 from mi_diffind.commands.cli import main
@@ -34,20 +33,6 @@ def scene_file(tmp_path, name="scene", reflectance=0.5):
         f'<bsdf type="diffuse"><spectrum name="reflectance" value="{reflectance}"/></bsdf></shape></scene>'
     )
     return str(path)
-
-
-def interrupt_at(number, monkeypatch):
-    """Ctrl-C in the pass with a number; the list of the passes that were rendered."""
-    original, taken = regress.loading.render_pass, []
-
-    def interrupting(*arguments):
-        taken.append(1)
-        if len(taken) == number:
-            os.kill(os.getpid(), signal.SIGINT)
-        return original(*arguments)
-
-    monkeypatch.setattr(regress.loading, "render_pass", interrupting)
-    return taken
 
 
 @pytest.fixture
@@ -189,7 +174,7 @@ def test_an_update_that_does_not_end_changes_nothing(mi_rgb, tmp_path, capsys, m
         patch.setattr(OpenEXR, "File", Failing)
         assert "cannot be written: disk full" in refused(capsys, "regress", path, "--update", "--seed", "1")
     assert file.read_bytes() == before and os.listdir(file.parent) == [file.name]
-    interrupt_at(1, monkeypatch)
+    interrupt_at(monkeypatch, regress.loading, "render_pass")
     code, result = check(path)
     assert (code, result["passed"]) == (130, None) and "interrupted" in capsys.readouterr().out
 
@@ -235,7 +220,7 @@ def test_an_interrupted_update_goes_on(mi_rgb, tmp_path, capsys, monkeypatch, ch
     folder, partial = tmp_path / "own", tmp_path / "own" / "scene.llvm_ad_rgb.partial.npz"
     update = [path, "--update", "--spp", "16", "--references"]
     assert check(*update, tmp_path / "undisturbed")[0] == 0
-    taken = interrupt_at(50, monkeypatch)
+    taken = interrupt_at(monkeypatch, regress.loading, "render_pass", 50)
     capsys.readouterr()
     assert check(*update, folder)[0] == 130
     assert f"{partial}: 100 samples a pixel are kept, the same command goes on" in capsys.readouterr().out

@@ -143,6 +143,7 @@ def test_every_plugin_has_a_manual_page_and_a_small_picture(mi_rgb):
     for name in names():
         page = manual_page(sys.modules[f"{plugins.__name__}.{name}"])
         assert f":monosp:`{name}`" in page and not re.search(r"^ *\{\w+\}$", page, re.M)
+        assert "``mitsuba``" in page and "mi-diffind render" in page  # which cannot load the plugin, and which can
         picture = DOCS / "pictures" / f"{name}.jpg"
         assert picture.stat().st_size <= maker.LARGEST
         assert Image.open(picture).size == (maker.WIDTH, maker.HEIGHT)

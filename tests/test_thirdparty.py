@@ -137,7 +137,7 @@ def test_inspect_and_decode(fitted, commands, tmp_path):
     found = json.loads((tmp_path / "r.json").read_text())
     assert found["peak_cd"] == 1537.0 and found["arrays"]["cascaded"]["resolution"] == [64]
     forms = found["measured_in_each_form"]
-    assert set(forms) == {"float32", "float16", "uint8"} and forms["uint8"]["bytes"] == 80
+    assert set(forms) == {"float32", "float16", "uint8"} and forms["uint8"]["bytes"] == 80 and "as uint8: 80 b" in out
     assert forms["float16"]["psnr_db"] == pytest.approx(found["measured"]["psnr_db"], rel=1e-4)
     assert 'output "back.png": found the extension ".png", allowed is .csv' in err
     assert "--width does not apply to this file" in err

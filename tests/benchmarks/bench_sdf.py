@@ -17,11 +17,10 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from frame import VARIANT, by_turns, parser, write
+from frame import VARIANT, against, by_turns, parser, write
 
 import mi_diffind  # noqa: F401
 from mi_diffind.measure.clock import machine, timed
-from mi_diffind.measure.statistics import spread
 from mi_diffind.studies.sdf import camera_rays, grid_scene, mesh_scene
 from mi_diffind.tasks.sdf import TASK, marching
 from mi_diffind.tasks.sdf.mesh import load_mesh
@@ -69,13 +68,9 @@ def measured(file: Path, resolution: int, rounds: int) -> dict:
         results = by_turns({name: functools.partial(timed, run) for name, run in passes.items()}, rounds, warm=2)
         seconds = {name: np.array(values) for name, values in results.items()}
         hits = {name: np.array(run()[1]) for name, run in passes.items()}
-        for name, values in seconds.items():
-            ratio = spread(values / seconds[MESH])
-            rows.append({
-                "rays": ray_set, "name": name, "ns": 1e9 * float(np.median(values)) / SIDE**2,
-                "ratio": ratio["median"], "ratio_quartiles": [ratio["q1"], ratio["q3"]],
-                "hits_differ": float((hits[name] != hits[MESH]).mean()),
-            })  # fmt: skip
+        for name, row in against(seconds, MESH, SIDE**2).items():
+            differ = float((hits[name] != hits[MESH]).mean())
+            rows.append({"rays": ray_set, "name": name, **row, "hits_differ": differ})
             print(json.dumps(rows[-1]), flush=True)
     return {
         "name": Path(model.table.settings["mesh_path"]).stem, "triangles": len(mesh.faces), "bytes": model.nbytes,

@@ -17,12 +17,11 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from frame import ASSETS, VARIANT, by_turns, parser, write
+from frame import ASSETS, VARIANT, against, by_turns, parser, write
 
 import mi_diffind
 from mi_diffind.core.compat import use_threads
 from mi_diffind.measure.clock import count_query, machine, timed, total
-from mi_diffind.measure.statistics import spread
 
 TILES = ASSETS / "tiles_filtered.npz"
 WIDTH, HEIGHT = 128, 128
@@ -66,18 +65,6 @@ def rounds(functions: dict, number: int) -> dict[str, np.ndarray]:
     """Return the seconds of the kernels of each function, by turns."""
     measured = {name: lambda f=function: timed(lambda: total(f())[0]) for name, function in functions.items()}
     return {name: np.array(values) for name, values in by_turns(measured, number).items()}
-
-
-def against(seconds: dict, base: str, count: int) -> dict[str, dict]:
-    """Return ns a lane, and the median ratio to ``base`` with its quartiles."""
-    rows = {}
-    for name, values in seconds.items():
-        ratio = spread(values / seconds[base])
-        rows[name] = {
-            "ns": float(np.median(values)) / count * 1e9, "ratio": ratio["median"],
-            "quartiles": [ratio["q1"], ratio["q3"]],
-        }  # fmt: skip
-    return rows
 
 
 def reads(path: Path, number: int) -> list[dict]:

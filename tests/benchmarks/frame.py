@@ -11,7 +11,10 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from mi_diffind.core.files import write_json
+from mi_diffind.measure.statistics import spread
 
 ROOT = Path(__file__).resolve().parents[2]
 ASSETS = ROOT / "scenes" / "assets"
@@ -46,3 +49,12 @@ def by_turns(functions: dict[str, Callable], rounds: int, warm: int = 1) -> dict
             if i >= warm:
                 results[name].append(value)
     return results
+
+
+def against(seconds: dict, base: str, count: int) -> dict[str, dict]:
+    """Return ns a lane, and the median ratio to ``base`` with its quartiles."""
+    rows = {}
+    for name, values in seconds.items():
+        ratio, ns = spread(values / seconds[base]), float(np.median(values)) / count * 1e9
+        rows[name] = {"ns": ns, "ratio": ratio["median"], "quartiles": [ratio["q1"], ratio["q3"]]}
+    return rows

@@ -26,22 +26,12 @@ BLACK = {"base_color": (0.0, 0.0, 0.0), "specular": 0.0}
 
 MATERIALS = {
     "rich": RICH,
-    "plain": {},
-    "diffuse": {"roughness": 1.0, "specular": 0.0},
-    "flat": {"flatness": 1.0, "roughness": 0.8, "base_color": (0.9, 0.1, 0.1)},
     "sheen_only": {**BLACK, "sheen": 1.0, "roughness": 1.0},
-    "tinted_sheen": {"base_color": (0.3, 0.1, 0.6), "sheen": 1.0, "sheen_tint": 1.0},
     "coat_only": {**BLACK, "roughness": 1.0, "clearcoat": 1.0, "clearcoat_gloss": 0.3},
     "glossy_coat": {**BLACK, "roughness": 1.0, "clearcoat": 1.0, "clearcoat_gloss": 1.0},
-    "metal": {"metallic": 1.0, "roughness": 0.3},
     "half_metal": {"metallic": 0.5, "base_color": (0.9, 0.6, 0.2), "roughness": 0.25, "clearcoat": 0.5},
-    "smooth_metal": {"metallic": 1.0, "roughness": 0.2},
-    "mirror": {"metallic": 1.0, "roughness": 0.05},
     "smoothest": {"metallic": 1.0, "roughness": 0.0},
-    "smooth_plastic": {"roughness": 0.05, "base_color": (0.2, 0.2, 0.7), "spec_tint": 1.0},
-    "anisotropic": {"metallic": 1.0, "roughness": 0.5, "anisotropic": 1.0},
     "brushed_mirror": {"metallic": 1.0, "roughness": 0.05, "anisotropic": 1.0},
-    "rough_metal": {"metallic": 1.0, "roughness": 1.0},
     "everything": {**dict.fromkeys(SCALARS, 1.0), "metallic": 0.5, "roughness": 0.3, "base_color": (1.0, 1.0, 1.0)},
 }
 

@@ -1,11 +1,10 @@
 """A small material, fitted, and a scene of it."""
 
 import dataclasses
-import json
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
+from texture_files import write_manifest
 
 from mi_diffind.arrays.tables import save_table
 from mi_diffind.core.runtime import array_module
@@ -26,11 +25,8 @@ def material(folder: Path) -> Path:
         "albedo": np.stack([0.5 + 0.3 * w + noise for w in waves], axis=-1),
         "roughness": 0.55 + 0.2 * waves[0] + noise,
     }
-    for name, values in maps.items():
-        mi.Bitmap(np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)).write(str(folder / f"{name}.png"))
-    manifest = folder / "material.json"
-    manifest.write_text(json.dumps({"maps": {name: f"{name}.png" for name in maps}}))
-    return manifest
+    maps = {name: np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8) for name, values in maps.items()}
+    return write_manifest(folder, maps, "material.json")
 
 
 def fitted(manifest: Path) -> Path:

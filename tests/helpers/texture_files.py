@@ -1,5 +1,7 @@
 """Files of the task ``texture`` without a training."""
 
+import json
+
 import numpy as np
 from arrays import aligned
 from scipy.ndimage import gaussian_filter
@@ -7,6 +9,7 @@ from scipy.ndimage import gaussian_filter
 from mi_diffind.arrays.tables import save_table
 from mi_diffind.core.runtime import array_module
 from mi_diffind.maps.pyramid import Pyramid
+from mi_diffind.maps.source import from_arrays
 from mi_diffind.tasks import image
 from mi_diffind.tasks.image import arrays as image_arrays
 from mi_diffind.tasks.image import training as image_training
@@ -30,6 +33,35 @@ def material(width, height):
     normal = 0.5 + 0.5 * np.concatenate([xy, np.sqrt(1 - (xy**2).sum(axis=-1, keepdims=True))], axis=-1)
     maps = {"albedo": wave[..., :3], "normal": normal, "roughness": wave[..., 3:]}
     return {name: np.rint(255 * values).astype(np.uint8) for name, values in maps.items()}
+
+
+def bumpy(size=32, metallic=1.0, roughness=0.25, seed=3):
+    """Maps of a material, bytes, whose normals differ from texel to texel."""
+    rng = np.random.default_rng(seed)
+    xy = 0.5 * rng.uniform(-1, 1, (size, size, 2))
+    normal = 0.5 + 0.5 * np.concatenate([xy, np.sqrt(1 - (xy**2).sum(axis=-1, keepdims=True))], axis=-1)
+    albedo = np.clip(0.7 + 0.1 * rng.standard_normal((size, size, 3)), 0, 1)
+    rough = np.clip(roughness + 0.05 * rng.standard_normal((size, size, 1)), 0, 1)
+    maps = {"albedo": albedo, "normal": normal, "roughness": rough, "metallic": np.full((size, size, 1), metallic)}
+    return {name: np.rint(255 * values).astype(np.uint8) for name, values in maps.items()}
+
+
+def pyramid_of(maps, types):
+    """Return the source of maps and their pyramid as ``fit texture`` has them; they repeat."""
+    source = from_arrays(maps)
+    layout = training.source_layout(source, PRESETS["ours"])
+    return source, Pyramid.from_source(source, layout, types, ("repeat", "repeat"))
+
+
+def write_manifest(folder, maps, name="m.json"):
+    """Write maps of bytes as PNG files beside a manifest that names them; return the manifest's path."""
+    import mitsuba as mi
+
+    for map_name, values in maps.items():
+        values = values[..., 0] if values.shape[2:] == (1,) else values
+        mi.Bitmap(np.ascontiguousarray(values)).write(str(folder / f"{map_name}.png"))
+    (folder / name).write_text(json.dumps({map_name: f"{map_name}.png" for map_name in maps}))
+    return folder / name
 
 
 def make(path, source, preset="ours", border="repeat", extras=None, **settings):

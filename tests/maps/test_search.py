@@ -6,10 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from mi_diffind.core.errors import UsageError
 from mi_diffind.fitting.loop import FitResult
 from mi_diffind.fitting.task import FitRequest, FitSettings, FittingError
-from mi_diffind.maps.search import EXCESS_DB, NEAR, check_psnr, search_by_psnr, search_lines
+from mi_diffind.maps.search import EXCESS_DB, NEAR, search_by_psnr, search_lines
 
 SOURCE = SimpleNamespace(nbytes=2**20)
 SETTINGS = FitSettings(steps=800)
@@ -88,11 +87,3 @@ def test_the_search_is_interrupted():
     assert len(calls) == 2 and result.interrupted and table.nbytes == min(t["bytes"] for t in tried)
     with pytest.raises(KeyboardInterrupt):
         search(lambda octaves: 20 + octaves, 40, interrupt=1)
-
-
-def test_options_that_exclude_each_other():
-    with pytest.raises(UsageError, match="--psnr: chooses the arrays: leave out --cascaded"):
-        check_psnr(FitRequest("ours", SETTINGS, None, options={"psnr": 40, "cascaded": 8}), "cascaded")
-    with pytest.raises(UsageError, match="--checkpoint: for one training, but --psnr makes several"):
-        check_psnr(FitRequest("ours", SETTINGS, None, options={"psnr": 40}, checkpoint="c.npz"))
-    check_psnr(FitRequest("ours", SETTINGS, None, options={"psnr": None, "cascaded": 8}), "cascaded")

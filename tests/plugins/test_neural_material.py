@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import texture_scenes
 from bsdf_queries import random_directions, uniform, vectors
-from texture_files import make, material
+from texture_files import make, material, write_manifest
 
 import mi_diffind
 from mi_diffind import plugins
@@ -332,11 +332,8 @@ def test_counterparts(mi, rng, tmp_path):
         "metallic": constant(1), "opacity": constant(0.8),
     }  # fmt: skip
     maps = {name: np.rint(255 * values).astype(np.uint8) for name, values in maps.items()}
-    for name, values in maps.items():
-        mi.Bitmap(values).write(str(tmp_path / f"{name}.png"))
-    names = ", ".join(f'"{name}": "{name}.png"' for name in maps)
-    (tmp_path / "paint.json").write_text(f'{{"maps": {{{names}}}}}')
-    mi_diffind.fit("texture", tmp_path / "paint.json", steps=1, progress=False).save(tmp_path / "paint.npz")
+    manifest = write_manifest(tmp_path, maps)
+    mi_diffind.fit("texture", manifest, steps=1, progress=False).save(tmp_path / "paint.npz")
     given = {"type": "neural_material", "filename": str(tmp_path / "paint.npz"), "two_sided": True, "clearcoat": 0.5}
     lamp = {"type": "point", "position": [1, -1, 2], "intensity": 1.0}
     scene = {**wall(mi, {**given, "clearcoat_sampling_rate": 2.0}), "lamp": lamp}

@@ -1,6 +1,5 @@
 """Plugins that declare themselves: found here and in other packages, checked, and known by what they were made from."""
 
-import re
 import subprocess
 import sys
 import textwrap
@@ -91,18 +90,6 @@ def test_plugins_of_this_package_say_what_they_are(mi):
     assert plugins.with_counterpart() == tuple(name for name in sorted(declared) if name.startswith("neural_"))
     assert plugins.with_counterpart("mipmap") == ("neural_material", "neural_texture")
     assert plugins.with_counterpart("principled") == ("disney", "neural_disney", "neural_material")
-
-
-def test_manual_pages_are_complete(mi):
-    """Shared parts are filled in; each page names the program that cannot load the plugin, and the one that can."""
-    folder = Path(plugins.__file__).parent
-    for name, plugin in plugins.declared().items():
-        parts = sys.modules[f"{plugins.__name__}.{name}"]
-        classes = [v for v in vars(parts).values() if isinstance(v, type) and v.__module__ == parts.__name__]
-        classes += [parts.integrator()] if hasattr(parts, "integrator") else []
-        (page,) = [c.__doc__ for c in classes if f"-{name}:" in (c.__doc__ or "")]
-        assert "``mitsuba``" in page and "mi-diffind render" in page and (folder / f"{name}.py").is_file()
-        assert not re.search(r"^ *\{\w+\}$", page, re.MULTILINE), plugin.name
 
 
 def test_program_of_mitsuba_loads_no_plugins(mi, tmp_path):

@@ -4,7 +4,6 @@ The truth is ``bitmap`` with the image that a file decodes to, and NumPy. Plugin
 """
 
 import itertools
-import json
 import math
 import os
 import re
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 import trust_properties as trust
 from arrays import aligned, numpy_of
-from texture_files import make, make_image, material
+from texture_files import make, make_image, material, write_manifest
 from texture_scenes import WRONG, ellipse, footprints, hits, isotropic, linear, plane, refused
 from variants import VARIANTS, set_variant, warnings_of
 
@@ -62,13 +61,8 @@ RENDERED = [v for v in VARIANTS if v.endswith(("ad_rgb", "ad_mono", "ad_spectral
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     """Return the file that each plugin reads; those with ``_clamp`` have arrays that do not repeat."""
-    import mitsuba as mi
-
     folder, source = tmp_path_factory.mktemp("contract"), from_arrays(material(*SIZE))
-    for name, values in material(*SIZE).items():
-        mi.Bitmap(values if values.shape[2] > 1 else np.ascontiguousarray(values[..., 0])).write(f"{folder}/{name}.png")
-    (folder / "wall.json").write_text(json.dumps({name: f"{name}.png" for name in material(*SIZE)}))
-    written = {"mipmap": str(folder / "wall.json")}
+    written = {"mipmap": str(write_manifest(folder, material(*SIZE)))}
     for border in ("repeat", "clamp"):
         end = "" if border == "repeat" else "_clamp"
         written[f"neural_image{end}"] = make_image(folder / f"image{end}.npz", source, border)
@@ -297,9 +291,7 @@ def test_seams(mi, tmp_path, name, filtering):
     """A repeated image goes on with any footprint; a mirrored or clamped one knows nothing of its other end."""
     halves = np.zeros((16, 16, 3), np.uint8)
     halves[:, 8:] = 255
-    mi.Bitmap(halves).write(str(tmp_path / "albedo.png"))
-    (tmp_path / "m.json").write_text('{"albedo": "albedo.png"}')
-    files = {"mipmap": str(tmp_path / "m.json")}
+    files = {"mipmap": str(write_manifest(tmp_path, {"albedo": halves}))}
     if name != "mipmap":
         files[name] = make(tmp_path / "a.npz", from_arrays({"albedo": halves}))
     for mode, expected in (("clamp", [0, 0, 1, 1]), ("mirror", [0, 0, 1, 1]), ("repeat", [linear(0.5)] * 4)):
@@ -332,10 +324,8 @@ def test_odd_sizes(mi, tmp_path, rng, name, shape):
     """Values between those of the image, at any footprint; a flat channel stays flat."""
     image = rng.integers(0, 256, (*shape, 3), np.uint8)
     image[..., 1] = 77
-    mi.Bitmap(image).write(str(tmp_path / "albedo.png"))
-    (tmp_path / "m.json").write_text('{"albedo": "albedo.png"}')
     source = from_arrays({"albedo": image})
-    files = {"mipmap": str(tmp_path / "m.json")}
+    files = {"mipmap": str(write_manifest(tmp_path, {"albedo": image}))}
     if name != "mipmap":
         files[name] = (make_image if name == "neural_image" else make)(tmp_path / "a.npz", source)
     si = hits(mi, rng.uniform(-1, 2, (2, 100)), *footprints(rng, 100, shape[::-1], 6))

@@ -10,10 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import trial_files
-
 from mi_diffind.commands import cli
-from mi_diffind.fitting.task import tasks
 
 SCENE = """
 <scene version="3.0.0">
@@ -34,8 +31,8 @@ FIT = ["-o", "own.npz", "--checkpoint", STATE, "--variant", "llvm_ad_rgb"]
 def run_command(arguments: list[str], folder: Path, moment: str = "", prepare: str = "") -> int | None:
     """Run a command in another process; return its number of calls, ``None`` if it was killed.
 
-    A moment is the number of a call in Python code: ``17`` kills the process in the 17th call of any function,
-    ``replace 2`` before the second file gets its final name. ``prepare`` names a function that is called first.
+    A moment is the number of a call in Python code: ``17`` kills the process in the 17th call of any function.
+    ``prepare`` names a function that is called first.
     """
     request = json.dumps({"arguments": arguments, "moment": moment, "prepare": prepare})
     done = subprocess.run(
@@ -57,14 +54,12 @@ def main(arguments: list[str], moment: str, prepare: str) -> None:
     """Run one command in this process."""
     if prepare:
         globals()[prepare]()
-    *replace, number = moment.split() or ["0"]
-    last, calls, replaced = int(number), 0, 0
+    last, calls = int(moment or 0), 0
 
     def count(frame, event, argument):
-        nonlocal calls, replaced
+        nonlocal calls
         calls += event in ("call", "c_call")
-        replaced += event == "c_call" and argument is os.replace
-        if last and (replaced if replace else calls) == last:
+        if last and calls == last:
             os.kill(os.getpid(), signal.SIGKILL)
 
     sys.setprofile(count)
@@ -118,15 +113,6 @@ def test_a_capture(tmp_path):
     command = ["capture", "../scene.xml", "-o", "views", "--views", "3", "--test", "1", "--resolution", "8",
                "--spp", "2", "--variant", "llvm_ad_rgb"]  # fmt: skip
     assert_same(*kill_and_go_on(command, tmp_path))
-
-
-def test_no_temporary_file_outlives_the_next_run(tmp_path):
-    """A run that is killed before its file has its name leaves a temporary one, which the next run removes."""
-    command = ["inspect", str(next(iter(trial_files.seeds(tasks()["ggx"]).values()))), "--json", "report.json"]
-    assert run_command(command, tmp_path, "replace 1") is None
-    assert len(list(tmp_path.iterdir())) == 1
-    run_command(command, tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
 
 
 if __name__ == "__main__":

@@ -88,21 +88,28 @@ def test_large_images_are_reduced(tmp_path, monkeypatch):
     refused(blender, r"r_1\.png: has 8 × 6 pixels, which cannot be reduced by the factor 7$", downscale=7)
 
 
-def test_masks_and_lenses_of_reduced_images(tmp_path):
-    u, v = photographs(tmp_path, **LENS)
+@pytest.mark.parametrize("factor", [1, 2])
+def test_alpha_masks_and_lenses_of_reduced_images(tmp_path, factor):
+    alpha = np.full((SIDE, SIDE), 255, np.uint8)
+    alpha[:, :20] = 0
+    photographs(tmp_path, alpha, **LENS)
     mask = np.full((SIDE, SIDE), 255, np.uint8)
     mask[31:] = 0
     Image.fromarray(mask).save(tmp_path / "mask.png")
     change(tmp_path, "transforms.json", frame=1, mask_path="mask.png")
-    views = load_views(tmp_path, downscale=2)
+    views = load_views(tmp_path, downscale=factor)
     focal, centre = views.focal[0], views.centre[0]
-    assert focal.tolist() == [25, 27.5] and centre.tolist() == [16.5, 15.25]
-    x, y = np.meshgrid(np.arange(SIDE // 2) + 0.5, np.arange(SIDE // 2) + 0.5)
+    assert (factor * focal).tolist() == [50, 55] and (factor * centre).tolist() == [33, 30.5]
+    x, y = np.meshgrid(np.arange(SIDE // factor) + 0.5, np.arange(SIDE // factor) + 0.5)
     u, v = (x - centre[0]) / focal[0], (y - centre[1]) / focal[1]
-    counted = views.counted(0) & (np.abs(u) < 0.55) & (np.abs(v) < 0.5)
-    assert counted.sum() > 500 and np.abs(views.image(0)[..., :3] - pattern(u, v))[counted].max() < 0.02
-    rows = 15.25 + 27.5 * shown_at(u, v, **LENS)[1]
-    np.testing.assert_array_equal(views.counted(1), rows < 15)
+    x, y = shown_at(u, v, **LENS)
+    x, y = 33 + 50 * x, 30.5 + 55 * y  # pixels of the photograph
+    image, seen = views.image(0), x > 20 + factor
+    assert (image[..., 3][x < 20 - factor] == 0).all() and (image[..., 3][seen] == 1).all()
+    seen &= (np.abs(u) < 0.55) & (np.abs(v) < 0.5)
+    assert seen.sum() > 300 and np.abs(image[..., :3] - pattern(u, v))[seen].max() < 0.01 * factor
+    assert views.counted(0).all()
+    np.testing.assert_array_equal(views.counted(1), y < 31 - 31 % factor)
 
 
 @pytest.mark.parametrize("lens", [LENS, {"k1": 0.1, "k2": 0.02, "k3": 0.01, "k4": 0.05, "k5": 0.01, "k6": 0.002}])
@@ -131,23 +138,6 @@ def test_a_lens_that_turns_back_is_cut_there(tmp_path):
     counted = load_views(tmp_path).counted(0)
     radius = np.hypot(u, v)
     assert counted[radius < 0.57].all() and not counted[radius > 0.58].any()
-
-
-def test_alpha_and_masks_are_undistorted_too(tmp_path):
-    alpha = np.full((SIDE, SIDE), 255, np.uint8)
-    alpha[:, :20] = 0
-    u, v = photographs(tmp_path, alpha, **LENS)
-    mask = np.zeros((SIDE, SIDE), np.uint8)
-    mask[:40] = 1
-    Image.fromarray(mask).save(tmp_path / "mask.png")
-    change(tmp_path, "transforms.json", frame=1, mask_path="mask.png")
-    views = load_views(tmp_path)
-    x, y = shown_at(u, v, **LENS)
-    x, y = 33 + 50 * x, 30.5 + 55 * y
-    assert (views.image(0)[..., 3][x < 19] == 0).all() and (views.image(0)[..., 3][x > 21] == 1).all()
-    assert np.abs(views.image(0)[..., :3] - pattern(u, v))[x > 21].max() < 0.01
-    assert views.counted(0).all()
-    np.testing.assert_array_equal(views.counted(1), y < 40)
 
 
 # -- backgrounds of one colour ----------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ import pytest
 from captures import SIZE, change, pose, refused, write_blender, write_exr, write_image
 from PIL import Image
 from radiance_fields import Fog
+from texture_scenes import linear
 
 from mi_diffind.images import srgb
 from mi_diffind.tasks.radiance import session
@@ -56,18 +57,12 @@ def blender(tmp_path):
     return write_blender(tmp_path)
 
 
-def linear(byte):
-    """IEC 61966-2-1, of one number."""
-    c = byte / 255
-    return c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4
-
-
 def test_pixels_are_linear_and_multiplied_by_alpha(blender):
     stored = write_image(blender / "train" / "r_0.png", 7)
     image = load_views(blender).image(0)
     for y, x in ((0, 0), (2, 5), (5, 7)):
         *colour, alpha = (int(v) for v in stored[y, x])
-        expected = [linear(c) * alpha / 255 for c in colour]
+        expected = [linear(c / 255) * alpha / 255 for c in colour]
         assert image[y, x] == pytest.approx([*expected, alpha / 255], abs=1e-6)
 
 
@@ -157,8 +152,8 @@ def test_images_without_alpha_are_opaque(blender):
     views = load_views(blender)
     images = captures.images_of(views)
     assert not views.has_alpha and (images[1:, ..., 3] == 1).all() and images[0, ..., 3].min() < 1
-    assert images[2, 3, 4, :3] == pytest.approx([linear(c) for c in stored[3, 4]], abs=1e-6)
-    assert images[1, 3, 4, :3] == pytest.approx([linear(grey[3, 4, 0])] * 3, abs=1e-6)
+    assert images[2, 3, 4, :3] == pytest.approx(linear(stored[3, 4] / 255), abs=1e-6)
+    assert images[1, 3, 4, :3] == pytest.approx(linear(grey[3, 4, [0, 0, 0]] / 255), abs=1e-6)
     assert views.names[3] == "train/r_3.jpg"
 
 

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from arrays import aligned, numpy_of
+from scipy.ndimage import map_coordinates
 
 from mi_diffind.arrays.tables import StoredArray, TableError, load_table, save_table
 from mi_diffind.core.runtime import array_module
@@ -50,12 +51,8 @@ def table():
 
 def bilinear(entries, x, y):
     """A grid whose outer entries are at 0 and 1, at (x, y) along columns and rows."""
-    rows, columns = entries.shape[:2]
-    i, j = min(int(y * (rows - 1)), max(rows - 2, 0)), min(int(x * (columns - 1)), max(columns - 2, 0))
-    a, b = y * (rows - 1) - i, x * (columns - 1) - j
-    i2, j2 = min(i + 1, rows - 1), min(j + 1, columns - 1)
-    above = (1 - b) * entries[i, j] + b * entries[i, j2]
-    return (1 - a) * above + a * ((1 - b) * entries[i2, j] + b * entries[i2, j2])
+    place = [[y * (entries.shape[0] - 1)], [x * (entries.shape[1] - 1)]]
+    return np.concatenate([map_coordinates(channel, place, order=1) for channel in np.moveaxis(entries, -1, 0)])
 
 
 def page_read(table, name, side, u, v):

@@ -1,6 +1,5 @@
 """``fit texture --shading``: what a material looks like, references, limited derivatives, training, command."""
 
-import contextlib
 import dataclasses
 import functools
 import json
@@ -12,6 +11,10 @@ import drjit as dr
 import numpy as np
 import pytest
 from arrays import aligned, numpy_of
+from bsdf_queries import interactions, texels
+from commands import refused
+from scipy.ndimage import map_coordinates
+from texture_files import bumpy, pyramid_of, write_manifest
 
 import mi_diffind
 from mi_diffind.arrays.tables import TableError, load_table, save_table
@@ -22,7 +25,6 @@ from mi_diffind.fitting import loop, task
 from mi_diffind.fitting.task import FitRequest
 from mi_diffind.maps import as_seen
 from mi_diffind.maps.model import size_figures
-from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.decoder import Decoder
@@ -47,24 +49,6 @@ OURS = PRESETS["ours"]
 @pytest.fixture(scope="module")
 def ad():
     return array_module("llvm")
-
-
-def bumpy(size=32, metallic=1.0, roughness=0.25, seed=3) -> dict:
-    """The maps of a metal whose normals differ from texel to texel."""
-    rng = np.random.default_rng(seed)
-    xy = 0.5 * rng.uniform(-1, 1, (size, size, 2))
-    normal = 0.5 + 0.5 * np.concatenate([xy, np.sqrt(1 - (xy**2).sum(axis=-1, keepdims=True))], axis=-1)
-    albedo = np.clip(0.7 + 0.1 * rng.standard_normal((size, size, 3)), 0, 1)
-    rough = np.clip(roughness + 0.05 * rng.standard_normal((size, size, 1)), 0, 1)
-    maps = {"albedo": albedo, "normal": normal, "roughness": rough, "metallic": np.full((size, size, 1), metallic)}
-    return {name: np.rint(255 * values).astype(np.uint8) for name, values in maps.items()}
-
-
-def pyramid_of(maps, ad):
-    source = from_arrays(maps)
-    return source, Pyramid.from_source(
-        source, textures.source_layout(source, TEXTURES["ours"]), ad, ("repeat", "repeat")
-    )
 
 
 def directions(ad, rng, n):
@@ -128,20 +112,12 @@ def test_shaded_is_mitsubas_normalmap(mi_rgb, rng):
         "roughness": rng.uniform(0.1, 1, (n, 1)),
         "metallic": rng.random((n, 1)),
     }
-
-    def texture(v):
-        data = np.ascontiguousarray(v[None], dtype=np.float32)
-        return {"type": "bitmap", "data": mi.TensorXf(data), "raw": True, "filter_type": "nearest"}
-
     bsdf = mi.load_dict({
-        "type": "normalmap", "normalmap": texture(0.5 + 0.5 * normal),
-        "bsdf": {"type": "disney", **{name: texture(v) for name, v in values.items()}},
+        "type": "normalmap", "normalmap": texels(mi, 0.5 + 0.5 * normal),
+        "bsdf": {"type": "disney", **{name: texels(mi, v) for name, v in values.items()}},
     })  # fmt: skip
-    si = dr.zeros(mi.SurfaceInteraction3f, n)
-    si.uv = mi.Point2f(mi.Float((np.arange(n) + 0.5) / n), 0.5)
-    si.sh_frame, si.dp_du, si.n = mi.Frame3f(mi.Normal3f(0, 0, 1)), mi.Vector3f(1, 0, 0), mi.Normal3f(0, 0, 1)
     wi, wo = directions(ad, rng, n)
-    si.wi = mi.Vector3f(*wi)
+    si = interactions(mi, mi.Vector3f(*wi), np.arange(n), n)
     expected = np.pi * np.stack([c.numpy() for c in bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(*wo))], -1)
 
     surface = shading_surface(ad, values["base_color"], normal, values["roughness"], values["metallic"])
@@ -184,7 +160,7 @@ def lanes(ad, rng, n, level):
 
 
 def test_converged_reference_is_the_mean_of_shaded_texels(ad, rng):
-    """The mean of bilinear reads in NumPy, shaded one by one."""
+    """The mean of bilinear reads by SciPy, shaded one by one."""
     size, n, level = 16, 6, 2.0
     source, pyramid = pyramid_of(bumpy(size, metallic=0.5), ad)
     effects, _ = material.material_effects(pyramid.layout)
@@ -193,15 +169,10 @@ def test_converged_reference_is_the_mean_of_shaded_texels(ad, rng):
     k = (np.arange(16) + 0.5) / 16 - 0.5
     x = (u[:, None, None] + k[None, None, :] * 4 / size) * size - 0.5 + np.zeros((n, 16, 16))
     y = (v[:, None, None] + k[None, :, None] * 4 / size) * size - 0.5 + np.zeros((n, 16, 16))
-    fx, fy = x - np.floor(x), y - np.floor(y)
-    x0, y0 = np.floor(x).astype(int) % size, np.floor(y).astype(int) % size
 
     def read(values):
-        total = 0
-        for i, a in ((0, 1 - fy), (1, fy)):
-            for j, b in ((0, 1 - fx), (1, fx)):
-                total = total + (a * b)[..., None] * values[(y0 + i) % size, (x0 + j) % size]
-        return total.reshape(n * 256, -1)
+        channels = [map_coordinates(c, [y, x], order=1, mode="grid-wrap") for c in np.moveaxis(values, -1, 0)]
+        return np.stack(channels, axis=-1).reshape(n * 256, -1)
 
     maps = {m.name: m.values.astype(np.float64) for m in source.maps}
     decode = np.where(maps["albedo"] <= 0.04045, maps["albedo"] / 12.92, ((maps["albedo"] + 0.055) / 1.055) ** 2.4)
@@ -437,18 +408,6 @@ def test_gradient_of_the_loss_is_that_of_finite_differences(start, ad):
 # -- the command ------------------------------------------------------------------------------------------------------
 
 
-def write_manifest(folder, maps):
-    import mitsuba as mi
-
-    folder.mkdir(exist_ok=True)
-    for name, values in maps.items():
-        image = np.ascontiguousarray(values if values.shape[2] == 3 else values[..., 0])
-        mi.Bitmap(image).write(str(folder / f"{name}.png"))
-    path = folder / "metal.json"
-    path.write_text(json.dumps({"maps": {name: f"{name}.png" for name in maps}}))
-    return path
-
-
 @pytest.fixture
 def manifest(tmp_path):
     return write_manifest(tmp_path, bumpy())
@@ -631,10 +590,7 @@ def test_auto_is_for_materials_whose_shading_changes(ad, unseen, tmp_path):
         (["--shading", "maybe"], "argument --shading: invalid choice"),
         (["--start", "x.npz", "--compression", "3x"], "--start: the arrays have their size, leave out --compression"),
         (["--start", "x.npz", "--skip", "3", "--structure", "auto"], "their size, leave out --structure, --skip"),
-        (
-            ["--start", "x.npz", "--shading", "off"],
-            "--start: found x.npz, but nothing is trained for its shading",
-        ),
+        (["--start", "x.npz", "--shading", "off"], "--start: found x.npz, but nothing is trained for its shading"),
         (["--lambda", "0.5", "--shading", "off"], "--lambda: found 0.5, but nothing is trained for its shading"),
         (["--preview", "x.png", "--shading", "off"], "--preview: found x.png, but nothing is trained for its shading"),
         (["--level-bias", "0.5"], "argument --level-bias: found '0.5', allowed are numbers from -4 to 0"),
@@ -642,17 +598,13 @@ def test_auto_is_for_materials_whose_shading_changes(ad, unseen, tmp_path):
     ],
 )
 def test_bad_arguments_are_one_sentence(manifest, tmp_path, capsys, changed, message):
-    with pytest.raises(SystemExit) if "argument " in message or "arguments" in message else contextlib.nullcontext():
-        assert main(["fit", "texture", str(manifest), "-o", str(tmp_path / "x.npz"), *changed]) == 2
-    assert message in capsys.readouterr().err
+    assert message in refused(capsys, "fit", "texture", manifest, "-o", tmp_path / "x.npz", *changed)
 
 
 @pytest.mark.parametrize("words", [["shading"], ["shading", "m.json", "-o", "m.npz", "--compression", "12x", "--help"]])
 def test_the_former_task_says_what_to_use(words, capsys):
     sentence = 'task "shading" is no more: materials are trained for their shading by fit texture, see its --shading'
-    with pytest.raises(SystemExit) as refused:
-        main(["fit", *words])
-    assert refused.value.code == 2 and capsys.readouterr().err.splitlines()[-1].endswith(sentence)
+    assert refused(capsys, "fit", *words).endswith(sentence)
     with pytest.raises(UsageError, match=sentence):
         mi_diffind.fit("shading", "m.json")
 

@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import json
 import math
 import re
 
@@ -10,6 +9,8 @@ import drjit as dr
 import numpy as np
 import pytest
 from arrays import aligned, numpy_of
+from scipy.ndimage import map_coordinates
+from texture_files import write_manifest
 
 from mi_diffind.arrays.tables import TableError, load_table, save_table
 from mi_diffind.commands.cli import main
@@ -188,18 +189,19 @@ def made():
     return source, texture, CompressedTexture.from_table(table, array_module("llvm").TensorXf, "float32"), table
 
 
+def interpolated(values, place):
+    """The channels of a grid at one place."""
+    return np.array([map_coordinates(channel, np.c_[place], order=1)[0] for channel in np.moveaxis(values, -1, 0)])
+
+
 def reference(texture, u, v, level):
     """Return a read in NumPy, one place at a time, from the entries: pointers summed, then one read."""
     net, structure = texture.net, texture.net.structure
 
     def bilinear(values, u, v):
-        places = []
-        for x, n, border in ((v, values.shape[0], texture.border[0]), (u, values.shape[1], texture.border[1])):
-            p = (x % 1 if border == "repeat" else x) * n - 0.5
-            i = math.floor(p)
-            ends = [i % n, (i + 1) % n] if border == "repeat" else [min(max(j, 0), n - 1) for j in (i, i + 1)]
-            places.append([(ends[0], 1 - (p - i)), (ends[1], p - i)])
-        return sum(a * b * values[i, j] for i, a in places[0] for j, b in places[1])
+        rows, columns = ("wrap" if border == "repeat" else "edge" for border in texture.border)
+        values = np.pad(np.pad(values, ((1, 1), (0, 0), (0, 0)), rows), ((0, 0), (1, 1), (0, 0)), columns)
+        return interpolated(values, [x * (n - 2) + 0.5 for x, n in zip((v, u), values.shape, strict=False)])
 
     coarse, levels, start = net.coarse.numpy().astype(np.float64), {}, 0
     for i, (rows, columns) in enumerate(structure.sizes[structure.skip :], structure.skip):
@@ -219,15 +221,8 @@ def reference(texture, u, v, level):
         found = (bilinear(array.numpy().astype(np.float64), u, v) - layer.zero) * layer.scale
         pointer[: layer.channels] += share * found
     place = [min(level / structure.skip, 1), *np.clip(pointer, 0, 1)]
-    cascaded, total = net.cascaded.numpy().astype(np.float64), 0
-    for corner in np.ndindex(*[2] * 4):
-        weight, index = 1, []
-        for x, n, up in zip(place, cascaded.shape, corner, strict=False):
-            lower = min(int(x * (n - 1)), n - 2)
-            weight *= (x * (n - 1) - lower) if up else 1 - (x * (n - 1) - lower)
-            index.append(lower + up)
-        total = total + weight * cascaded[tuple(index)]
-    return total
+    cascaded = net.cascaded.numpy().astype(np.float64)
+    return interpolated(cascaded, np.multiply(place, np.array(cascaded.shape[:-1]) - 1))
 
 
 def test_reading_against_numpy(made, rng):
@@ -349,19 +344,11 @@ def test_a_level_bias_is_a_finer_level(made, tmp_path):
 # -- the command line -------------------------------------------------------------------------------------------------
 
 
-def write(path, array):
-    import mitsuba as mi
-
-    mi.Bitmap(np.ascontiguousarray(array)).write(str(path))
-
-
 def test_fit_inspect_decode(tmp_path, monkeypatch, capsys):
     import mitsuba as mi
 
     monkeypatch.chdir(tmp_path)
-    for name, values in material().items():
-        write(f"{name}.png", values if values.shape[2] > 1 else values[..., 0])
-    (tmp_path / "m.json").write_text(json.dumps({name: f"{name}.png" for name in ("albedo", "normal", "roughness")}))
+    write_manifest(tmp_path, material())
     short = ["--steps", "3", "--batch", "2048", "--border", "clamp", "--variant", "llvm_ad_rgb"]
     assert main(["fit", "texture", "m.json", "-o", "m.npz", "--compression", "4x", "--level-bias", "-0.5", *short,
                  "--shading", "off"]) == 0  # fmt: skip
@@ -392,7 +379,7 @@ def test_options_that_do_not_go_together(tmp_path):
     ):
         with pytest.raises(UsageError, match=re.escape(message)):
             task.fit("texture", **({"source": source} if given else {}), **given)
-    write(source, material(8, 8)["albedo"])
+    write_manifest(tmp_path, {"no": material(8, 8)["albedo"]})
     for given, message in (
         ({"skip": 4}, "--skip: found 4, the texture has levels 0 to 3"),
         ({"structure": "0:1:2,2:1:4", "skip": 2}, "--skip: found 2, the structure has a fine array on level 2"),
