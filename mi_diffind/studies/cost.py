@@ -57,14 +57,21 @@ DISNEY = {"base_color": {"type": "rgb", "value": [0.6, 0.3, 0.2]}, "roughness": 
 METAL = {"eta": {"type": "rgb", "value": [0.2, 0.9, 1.1]}, "k": {"type": "rgb", "value": [3.9, 2.4, 2.2]}, "alpha": 0.2}
 COPPER = {"type": "roughconductor", "distribution": "ggx", "material": "Cu", "alpha": 0.03}
 
+#: Light of a row → emitter.
+LIGHTS = {
+    "sky": {"type": "envmap", "filename": str(ASSETS / "forest.exr")},
+    "sun": {"type": "directional", "direction": [-0.55, -0.6, -0.35], "irradiance": 3.0},
+}
+
 
 @dataclass(frozen=True)
 class Row:
     """Row of the study: ``contenders`` (name → plugin of Mitsuba) at a ``place`` of the scene.
 
-    ``place``: ``"ball"`` or ``"floor"`` (a BSDF), or ``"shape"``. ``keys``: pattern of the parameters that a step
-    derives. ``references``: name → the contender whose picture of many samples that of ``name`` is compared with, where
-    it is not the first. ``samples``: name → samples a pixel, where they are not those of the others.
+    ``place``: ``"ball"`` or ``"floor"`` (a BSDF), ``"shape"``, or ``"scene"`` (BSDFs ``floor`` and ``objects``, a ball
+    and a mesh). ``keys``: pattern of the parameters that a step derives. ``references``: name → the contender whose
+    picture of many samples that of ``name`` is compared with, where it is not the first. ``samples``: name → samples a
+    pixel, where they are not those of the others. ``light``: one of :data:`LIGHTS`.
     """
 
     title: str
@@ -73,6 +80,7 @@ class Row:
     keys: str
     references: dict[str, str] = field(default_factory=dict)
     samples: dict[str, int] = field(default_factory=dict)
+    light: str = "sky"
 
     @property
     def first(self) -> str:
@@ -84,16 +92,16 @@ class Row:
         return self.references.get(name, self.first)
 
 
-def _material(material: str, bsdf: str = "principled", texture: str = "bitmap", file: str = "") -> dict:
-    """Return a normal map around a BSDF, with textures of bitmaps, or of a file of tables."""
+def material(maps: str, bsdf: str = "principled", texture: str = "bitmap", file: str = "") -> dict:
+    """Return a normal map around a BSDF, with textures of bitmaps ``MAPS_ROLE.png``, or of a file of tables."""
 
     def read(role: str) -> dict:
         if file:
             return {"type": texture, "filename": file, "channels": role}
-        return {"type": texture, "filename": f"{material}_{role}.png", "raw": role != "albedo"}
+        return {"type": texture, "filename": f"{maps}_{role}.png", "raw": role != "albedo"}
 
     roles = {"base_color": "albedo", "roughness": "roughness", "metallic": "metallic"}
-    inner = {name: read(role) for name, role in roles.items() if (material, role) != ("tiles", "metallic")}
+    inner = {name: read(role) for name, role in roles.items() if (maps, role) != ("tiles", "metallic")}
     return {"type": "normalmap", "normalmap": read("normal"), "bsdf": {"type": bsdf, **inner}}
 
 
@@ -121,20 +129,20 @@ ROWS = {
     ),
     "image": Row(
         "maps of tiles, unfiltered", "floor",
-        {"bitmap": _material("tiles"), "neural_image": _material("tiles", texture="neural_image", file="tiles.npz")},
+        {"bitmap": material("tiles"), "neural_image": material("tiles", texture="neural_image", file="tiles.npz")},
         r".*floor\.bsdf\..*(data|tables\..*)",
     ),
     "texture": Row(
         "maps of tiles, filtered", "floor",
-        {"bitmap": _material("tiles"), "bitmap, 4 samples": _material("tiles"), "bitmap, 1 sample": _material("tiles"),
-         "mipmap": _material("tiles", texture="mipmap"),
-         "neural_texture": _material("tiles", texture="neural_texture", file="tiles_filtered.npz")},
+        {"bitmap": material("tiles"), "bitmap, 4 samples": material("tiles"), "bitmap, 1 sample": material("tiles"),
+         "mipmap": material("tiles", texture="mipmap"),
+         "neural_texture": material("tiles", texture="neural_texture", file="tiles_filtered.npz")},
         r".*floor\.bsdf\..*(data|levels.*|tables\..*)",
         samples={"bitmap, 1 sample": 1, "bitmap, 4 samples": 4},
     ),
     "material": Row(
         "rust", "floor",
-        {"normalmap, principled, bitmaps": _material("rust"), "normalmap, disney, bitmaps": _material("rust", "disney"),
+        {"normalmap, principled, bitmaps": material("rust"), "normalmap, disney, bitmaps": material("rust", "disney"),
          "neural_material": {"type": "neural_material", "filename": "rust_shaded.npz"}},
         r".*floor\.bsdf\..*(data|tables\..*)",
         references=dict.fromkeys(("normalmap, disney, bitmaps", "neural_material"), "normalmap, disney, bitmaps"),
@@ -249,11 +257,17 @@ def grid_of_mesh(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def load_scene(row: Row, name: str, step: bool, settings: CostSettings):
-    """Return the scene of a contender: a floor and a ball or a solid, under an environment light."""
+    """Return the scene of a contender: a floor, with a ball or a solid or both, under a light."""
     part, side = plugin(row.contenders[name], "float32" if step else ""), settings.step if step else settings.render
+    objects, move = {"type": "ref", "id": "objects"}, mi.ScalarTransform4f().translate([0.7, 0, 0]).scale(0.7)
     parts = {
         "ball": {"ball": {"type": "sphere", "center": [0, 0.8, 0], "radius": 0.8, "bsdf": part}},
         "shape": {"shape": part},
+        "scene": {
+            "objects": part.get("objects"),
+            "ball": {"type": "sphere", "center": [-0.8, 0.6, 0.2], "radius": 0.6, "bsdf": objects},
+            "mesh": {"type": "ply", "filename": str(ASSETS / "suzanne.ply"), "to_world": move, "bsdf": objects},
+        },
     }.get(row.place, {})
     turn = mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(6)
     return loading.load_dict({
@@ -267,9 +281,9 @@ def load_scene(row: Row, name: str, step: bool, settings: CostSettings):
                 "type": "hdrfilm", "width": side, "height": side, "pixel_format": "rgb", "rfilter": {"type": "box"},
             },
         },
-        "sky": {"type": "envmap", "filename": str(ASSETS / "forest.exr")},
+        "light": LIGHTS[row.light],
         "floor": {"type": "rectangle", "to_world": turn,
-                  "bsdf": part if row.place == "floor" else {"type": "diffuse", "reflectance": 0.5}},
+                  "bsdf": part.get("floor", part if row.place == "floor" else {"type": "diffuse", "reflectance": 0.5})},
         **parts,
     })  # fmt: skip
 

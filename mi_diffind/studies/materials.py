@@ -45,7 +45,7 @@ class MaterialStudy(Study):
         parser.add_argument("--compression", action="append", default=[], metavar="N",
                             help=f"compression ratio; may be repeated (default: {default}; --quick: 12x)")  # fmt: skip
         parser.add_argument("--seconds", type=positive, metavar="N",
-                            help="seconds of each training of ours (default: 60; --quick: 2)")  # fmt: skip
+                            help="seconds of each training of ours (default: steps of fit; --quick: 2)")  # fmt: skip
 
     def check(self, arguments) -> None:
         """Check the options and load the source; raise as :func:`.load_source` does."""
@@ -59,7 +59,7 @@ class MaterialStudy(Study):
         quick = arguments.quick
         return SimpleNamespace(
             compressions=arguments.ratios,
-            seconds=float(arguments.seconds or (2 if quick else 60)),
+            seconds=arguments.seconds or (2 if quick else None),
             astc="fast" if quick else "thorough",  # "exhaustive" takes many times as long
             network_steps=(10, 20) if quick else (1000, 16000),
         )
@@ -87,7 +87,7 @@ def level_pyramid(maps: Levels, like: Pyramid) -> Pyramid:
 
 
 def level_errors(truth: Levels, maps: Levels) -> list[float]:
-    """Return the PSNR of all channels together, in dB, of each level at its texel centres."""
+    """Return the PSNR of all channels of the maps of ``truth``, in dB, of each level at its texel centres."""
     mse = [
         [float(np.mean((a.astype(np.float64) - b) ** 2)) for a, b in zip(levels, maps[name], strict=True)]
         for name, levels in truth.items()

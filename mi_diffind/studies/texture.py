@@ -163,7 +163,9 @@ class TextureContenders(MaterialContenders):
         return {name: self.render(bitmap, scene, 1 << 20) for name, scene in self.scenes.items()}
 
     def record(self, nbytes: int, seconds: float | None, levels: Levels, **details) -> dict:
-        details |= {"ratio": self.source.nbytes / nbytes, "levels": {"all": level_errors(self.levels, levels)}}
+        truths = {"all": self.levels} | {name: {name: images} for name, images in self.levels.items()}
+        psnr = {name: level_errors(truth, levels) for name, truth in truths.items()}
+        details |= {"ratio": self.source.nbytes / nbytes, "levels": psnr}
         return {"bytes": nbytes, "seconds": seconds, "details": details}
 
     def render(self, read: TextureReader, scene: TextureScene, seed: int = 0) -> np.ndarray:

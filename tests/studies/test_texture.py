@@ -88,6 +88,8 @@ def test_levels(mi_rgb):
     found = materials.level_errors(truth, changed)
     mse = np.mean((changed["albedo"][1][..., 2] - truth["albedo"][1][..., 2]) ** 2)
     assert found[1] == pytest.approx(-10 * math.log10(mse / 4), abs=1e-3) and found[0] == found[2] == 120
+    each = [materials.level_errors({name: truth[name]}, changed)[1] for name in ("albedo", "ao")]
+    assert each == pytest.approx([-10 * math.log10(mse / 3), 120], abs=1e-3)
     decoded = materials.level_images(materials.level_pyramid(changed, pyramid))
     for name, values in changed.items():
         for a, b in zip(values, decoded[name], strict=True):
