@@ -16,6 +16,7 @@ from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from statistics import fmean as mean
+from statistics import median
 from typing import Any
 
 from mi_diffind.fitting.task import tasks
@@ -308,7 +309,6 @@ RENDERS = (
     "ours 12x, trilinear", "ours 12x, anisotropic, centred", "ASTC 12x, anisotropic, centred",
 )  # fmt: skip
 
-#: Error of a contender that is the reference itself.
 #: Functions and constants of an expression, by name.
 FUNCTIONS = {
     f.__name__: f
@@ -319,7 +319,7 @@ FUNCTIONS = {
         surface_errors, trust_cell, shaded_renders, shaded_contenders, over_filters, shipped,
         trust_cells,
     )
-} | {"mean": mean, "RENDERS": RENDERS}  # fmt: skip
+} | {"mean": mean, "median": median, "RENDERS": RENDERS}  # fmt: skip
 
 
 # -- evaluation --------------------------------------------------------------------------------------------------------
