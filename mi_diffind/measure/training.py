@@ -117,16 +117,16 @@ class ConvergenceTraining(Contender):
     ``problem()`` returns a new problem with untrained parameters; ``settings`` are those of the first, shortest run,
     ``longest`` is the largest number of steps; each run is measured ``measurements`` times. ``half``: the parameters
     are rounded to half precision. ``finish(net, record)`` returns further entries of the record, such as ``bytes`` and
-    ``errors``. The model, :attr:`net`, is the trained module of the best run.
+    ``errors``. ``gain`` stands for :data:`GAIN`. The model, :attr:`net`, is the trained module of the best run.
     """
 
     def __init__(
         self, name: str, problem: Callable[[], Problem], settings: FitSettings, longest: int, measurements: int = 20,
-        half: bool = False, finish: Callable[[object, dict], dict] = lambda net, record: {},
+        half: bool = False, finish: Callable[[object, dict], dict] = lambda net, record: {}, gain: float = GAIN,
     ):  # fmt: skip
         super().__init__(name, "", 0.0, ConvergenceTraining.train, lambda job: job.net)
         self.problem, self.settings, self.longest = problem, settings, longest
-        self.measurements, self.half, self.finish = measurements, half, finish
+        self.measurements, self.half, self.finish, self.gain = measurements, half, finish, gain
 
     def cached_record(self, folder: Path | None) -> dict | None:
         """Return the record that :meth:`run` wrote to ``folder``, if its settings are the same."""
@@ -165,14 +165,14 @@ class ConvergenceTraining(Contender):
             runs.append(run)
             if best is None or run["psnr_db"] >= best["psnr_db"]:
                 best, self.net = run, problem.net
-            if (gain is not None and gain < GAIN) or 2 * steps > self.longest:
+            if (gain is not None and gain < self.gain) or 2 * steps > self.longest:
                 break
             steps *= 2
         record = {
             "name": self.name,
             **best,
             "gain_db": gain,
-            "converged": gain is not None and abs(gain) < GAIN,
+            "converged": gain is not None and abs(gain) < self.gain,
             "entries": sum(int(np.prod(self.net[key].shape)) for key in self.net),
             "settings": self._settings(),
             "runs": runs,

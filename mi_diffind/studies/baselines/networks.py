@@ -47,7 +47,7 @@ MEASURED = 2**17
 class Network(nn.Module):
     """Multilayer perceptron from ``inputs`` coordinates to as many numbers as ``outputs``.
 
-    There are ``layers`` hidden layers of ``width`` leaky rectified units. With ``grid``, the options of
+    There are ``layers`` hidden layers of ``width`` units, by default leaky rectified. With ``grid``, the options of
     ``nn.HashGridEncoding``, a hash grid encodes the coordinates; ``direct`` further coordinates bypass it. A call with
     a list of coordinates returns a list of arrays. As allocated, the network computes with tensors, the faster form to
     train; :meth:`cooperative` returns it in cooperative vectors.
@@ -57,10 +57,10 @@ class Network(nn.Module):
 
     def __init__(
         self, inputs: int = 2, width: int = 16, layers: int = 2, grid: dict | None = None, outputs: int = 1,
-        direct: int = 0,
+        direct: int = 0, activation: type[nn.Module] = nn.LeakyReLU,
     ):  # fmt: skip
         self.inputs, self.width, self.layers, self.grid = inputs, width, layers, grid
-        self.outputs, self.direct = outputs, direct
+        self.outputs, self.direct, self.activation = outputs, direct, activation
         self.entries = self.mlp = self.encoding = None
         self.is_cooperative = False
 
@@ -73,7 +73,7 @@ class Network(nn.Module):
             size = self.grid["n_levels"] * self.grid["n_features_per_level"] + self.direct
         hidden = []
         for _ in range(self.layers):
-            hidden += [nn.Linear(-1, self.width), nn.LeakyReLU()]
+            hidden += [nn.Linear(-1, self.width), self.activation()]
         result.mlp = nn.Sequential(*hidden, nn.Linear(self.width, self.outputs)).alloc(dtype, size, rng)
         return result, self.outputs
 

@@ -145,14 +145,7 @@ class NetworkTruth(Truth):
     def value(self, wi, wo):
         Float, UInt32 = type(wo.z), dr.uint32_array_t(type(wo.z))
         weights = (dr.gather(Float, self.weights, UInt32(k)) for k in range(WEIGHTS))
-        half = wi + wo
-        half = half * dr.rsqrt(dr.maximum(dr.squared_norm(half), 1e-20))
-        sin = dr.sqrt(dr.square(half.x) + dr.square(half.y))
-        cos_phi = dr.select(sin > 1e-6, half.x * dr.rcp(dr.maximum(sin, 1e-6)), 1)
-        sin_phi = dr.select(sin > 1e-6, half.y * dr.rcp(dr.maximum(sin, 1e-6)), 0)
-        along = dr.fma(cos_phi, wi.x, sin_phi * wi.y)
-        difference = [dr.fma(half.z, along, -sin * wi.z), dr.fma(cos_phi, wi.y, -sin_phi * wi.x)]
-        units = [sin, Float(0), half.z, *difference, dr.fma(sin, along, half.z * wi.z)]
+        units = half_and_difference(wi, wo)
         for layer, count in enumerate(LAYERS[1:]):
             matrix = [[next(weights) for _ in range(count)] for _ in units]
             sums = [next(weights) for _ in range(count)]
@@ -160,6 +153,18 @@ class NetworkTruth(Truth):
                 sums = [dr.fma(x, weight, total) for weight, total in zip(row, sums, strict=True)]
             units = [dr.maximum(x, 0) for x in sums] if layer < len(LAYERS) - 2 else sums
         return [clamp(wo.z * (dr.exp(x) - 1), 0, LARGEST) for x in units]
+
+
+def half_and_difference(wi, wo) -> list:
+    """Return the components of the half vector at azimuth 0, and of the difference vector (Rusinkiewicz 1998)."""
+    half = wi + wo
+    half = half * dr.rsqrt(dr.maximum(dr.squared_norm(half), 1e-20))
+    sin = dr.sqrt(dr.square(half.x) + dr.square(half.y))
+    cos_phi = dr.select(sin > 1e-6, half.x * dr.rcp(dr.maximum(sin, 1e-6)), 1)
+    sin_phi = dr.select(sin > 1e-6, half.y * dr.rcp(dr.maximum(sin, 1e-6)), 0)
+    along = dr.fma(cos_phi, wi.x, sin_phi * wi.y)
+    difference = [dr.fma(half.z, along, -sin * wi.z), dr.fma(cos_phi, wi.y, -sin_phi * wi.x)]
+    return [sin, type(sin)(0), half.z, *difference, dr.fma(sin, along, half.z * wi.z)]
 
 
 def open_networks(path: Path) -> Archive:

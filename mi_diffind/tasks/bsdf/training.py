@@ -137,7 +137,7 @@ def proxy_starts(samples: Samples, types) -> list[np.ndarray]:
     ranked = []
     for i, j in itertools.combinations(range(len(shapes)), 2):
         chosen = [0, 2 * i + 1, 2 * i + 2, 2 * j + 1, 2 * j + 2]
-        colours = _non_negative(gram[np.ix_(chosen, chosen)], right[chosen])
+        colours = non_negative(gram[np.ix_(chosen, chosen)], right[chosen])
         error = np.abs(basis[:, chosen] @ colours - target).mean()
         ranked.append((error, i, j, colours))
     ranked.sort(key=lambda entry: entry[0])
@@ -147,7 +147,7 @@ def proxy_starts(samples: Samples, types) -> list[np.ndarray]:
     return [_logarithms(shapes[i], shapes[j], colours) for _, i, j, colours in ranked[:STARTS]]
 
 
-def _non_negative(gram: np.ndarray, right: np.ndarray) -> np.ndarray:
+def non_negative(gram: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return x ≥ 0, ``(n, 3)``, that minimises |Ax − b|² by sweeps over its entries, from AᵀA and Aᵀb."""
     x = np.zeros_like(right)
     diagonal = np.maximum(np.diag(gram), 1e-30)
