@@ -114,7 +114,7 @@ def label_strip(row: int):
 
 def write_labels() -> None:
     """Write labels.png: name, bytes and PSNR of the learned files, row by row, dark on the wall's albedo."""
-    from mi_diffind.tasks.bsdf.files import load
+    import mi_diffind
 
     width, line = round(9.2 * PIXELS), round(0.14 * PIXELS)
     font = ImageFont.truetype(str(Path(get_data_path(), "fonts/ttf/DejaVuSans.ttf")), 28)
@@ -123,7 +123,7 @@ def write_labels() -> None:
     draw = ImageDraw.Draw(image)
     for row, names in enumerate(ROWS.values()):
         for column, name in enumerate(names):
-            table = load(LIBRARY / f"{name}.npz")
+            table = mi_diffind.open(LIBRARY / f"{name}.npz").table
             title = name.removeprefix("networks_").removeprefix("fits_").replace("_", " ").replace("-", " ")
             lines = title, f"{table.nbytes:,} bytes, {table.measured['psnr_db']:.1f} dB"
             for k, text in enumerate(lines):

@@ -145,17 +145,14 @@ def has_gradient(value) -> bool:
     return dr.is_diff_v(value) and value.index_ad != 0
 
 
-#: Held while ``dr.syntax`` transforms a function.
-_TRANSFORMING = threading.RLock()
+#: Held while a syntax tree is made. Mitsuba loads plugins in several threads, and CPython 3.11 keeps one depth of syntax
+#: trees for all of them: where two meet, "SystemError: AST constructor recursion depth mismatch" may end one.
+SYNTAX_TREES = threading.RLock()
 
 
 def syntax(function):
-    """Apply ``dr.syntax`` to a function while no other thread does.
-
-    Mitsuba loads plugins in several threads. CPython 3.11 keeps one depth of syntax trees for all of them, and may end
-    a transformation by "SystemError: AST constructor recursion depth mismatch" where two meet.
-    """
-    with _TRANSFORMING:
+    """Apply ``dr.syntax`` to a function while no other thread makes a syntax tree."""
+    with SYNTAX_TREES:
         return dr.syntax(function)
 
 

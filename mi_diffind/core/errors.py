@@ -63,12 +63,12 @@ class UsageError(DiffindError):
 
 
 @contextlib.contextmanager
-def raised_as(kind: type[Exception], *caught: type[Exception], at: object = ""):
-    """Raise the ``caught`` errors as one of another ``kind``, in the same words, after the place ``at``."""
+def raised_as(error_type: type[Exception], *caught: type[Exception], at: object = ""):
+    """Raise the ``caught`` errors as one of another ``error_type``, in the same words, after the place ``at``."""
     try:
         yield
     except caught as e:
-        raise kind(f"{at}: {e}" if at else str(e)) from None
+        raise error_type(f"{at}: {e}" if at else str(e)) from None
 
 
 def reason(error: BaseException, **names: str) -> str:

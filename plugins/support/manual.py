@@ -8,6 +8,8 @@ import re
 import textwrap
 from types import ModuleType
 
+from mi_diffind.core import compat
+
 #: Name of a placeholder → the text that stands for it: rows of the parameter table, and paragraphs.
 PARTS = {
     "channels": """\
@@ -130,7 +132,8 @@ TAGS = {str: "string", float: "float", list: "rgb"}
 
 def _example(object_type: str, name: str, arguments: str) -> str:
     """Return tabs with a plugin in XML and as a dictionary; ``arguments`` are those of a call in Python."""
-    name, call = name.rstrip(":"), ast.parse(f"example({arguments})", mode="eval").body
+    with compat.SYNTAX_TREES:
+        name, call = name.rstrip(":"), ast.parse(f"example({arguments})", mode="eval").body
     xml, python = [f'<{object_type} type="{name}">'], [f"'type': '{name}'"]
     for keyword in call.keywords:
         value = ast.literal_eval(keyword.value)
