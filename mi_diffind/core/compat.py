@@ -145,8 +145,8 @@ def has_gradient(value) -> bool:
     return dr.is_diff_v(value) and value.index_ad != 0
 
 
-#: Held while a syntax tree is made. Mitsuba loads plugins in several threads, and CPython 3.11 keeps one depth of syntax
-#: trees for all of them: where two meet, "SystemError: AST constructor recursion depth mismatch" may end one.
+#: Held while a syntax tree is made. Mitsuba loads plugins in several threads, and CPython 3.11 keeps one depth of
+#: syntax trees for all of them: where two meet, "SystemError: AST constructor recursion depth mismatch" may end one.
 SYNTAX_TREES = threading.RLock()
 
 
