@@ -54,7 +54,7 @@ class NeuralBSDF(mi.BSDF):
 
      * - energy
        - |string|
-       - ``source``: the directional albedo is at most 0.18% above the source's, by a factor s(θ_i) s(θ_o) of the
+       - ``source``: the directional albedo is at most 0.30% above the source's, by a factor s(θ_i) s(θ_o) of the
          file; ``raw``: as it was fitted. (Default: ``source``)
        - --
 
