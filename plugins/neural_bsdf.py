@@ -54,8 +54,9 @@ class NeuralBSDF(mi.BSDF):
 
      * - energy
        - |string|
-       - ``source``: the directional albedo is at most 0.30% above the source's, by a factor s(θ_i) s(θ_o) of the
-         file; ``raw``: as it was fitted. (Default: ``source``)
+       - ``source``: the directional albedo is at most 0.30% above the source's (that of its symmetric part, if it is
+         not reciprocal), and limited to 1, by a factor s(θ_i) s(θ_o) of the file; ``raw``: as it was fitted.
+         (Default: ``source``)
        - --
 
      * - evaluate

@@ -24,7 +24,7 @@ from ...measure.report import grid
 from .files import load
 from .fit import use_rgb_variant
 from .functions import is_table
-from .shifted_gamma import read_fits
+from .shifted_gamma import may_hold_fits
 from .truth import SUFFIXES, material_ids
 
 #: Material that stands for all of a scene.
@@ -220,13 +220,10 @@ def find_materials(request: FitRequest, folder: Path) -> tuple[dict[str, Library
 
 
 def _may_be_source(file: Path) -> bool:
-    """Return whether a file with an extension of sources is neither a table file nor JSON without fits."""
+    """Return whether a file with an extension of sources is neither a table file nor JSON of something else."""
     if file.suffix.lower() == ".npz":
         return not is_table(file)
-    try:
-        return file.suffix.lower() != ".json" or bool(read_fits(file))
-    except UsageError:
-        return False
+    return file.suffix.lower() != ".json" or may_hold_fits(file)
 
 
 def _free_name(text: str, names: set[str]) -> str:

@@ -20,6 +20,8 @@ import numpy as np
 from ...arrays.indirection import device_array
 from ...arrays.lookup import clamp
 from ...core.errors import UsageError, reason
+from ...core.files import irregular
+from ...core.units import memory
 from .measured import LARGEST, Truth
 
 #: Names of the numbers of a channel, as in files of fits.
@@ -47,6 +49,18 @@ class ShiftedGammaTruth(Truth):
         Float, UInt32 = type(wo.z), dr.uint32_array_t(type(wo.z))
         numbers = [dr.gather(Float, self.numbers, UInt32(k)) for k in range(3 * len(NUMBERS))]
         return [clamp(wo.z * v, 0, LARGEST) for v in shifted_gamma(numbers, wi, wo)]
+
+
+def may_hold_fits(path: Path) -> bool:
+    """Return whether a ``.json`` file is damaged, or one of its entries has a colour of a fit, as no other JSON."""
+    if irregular(path, memory() // 4):  # a pipe would block
+        return True
+    try:
+        content = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError):
+        return True
+    entries = content.values() if isinstance(content, dict) else ()
+    return any(isinstance(entry, dict) and not entry.keys().isdisjoint(NUMBERS[:2]) for entry in entries)
 
 
 def read_fits(path: Path) -> dict[str, np.ndarray]:

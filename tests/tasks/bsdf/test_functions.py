@@ -209,7 +209,7 @@ def shifted_gamma(numbers, wi, wo):
 
 
 def test_fits_of_the_shifted_gamma_distribution(types, tmp_path, rng):
-    """Values are those of the published formulas; other JSON in a folder is no source, but is refused by itself."""
+    """Values are those of the published formulas; other JSON in a folder is no source, damaged fits are named."""
     channel = {"rhoD": 0.2, "rhoS": 0.4, "f0": 0.3, "f1": 0.2, "kap": 9.0, "alpha": 0.05, "p": 0.6, "lambda": 2.5,
                "c": 0.02, "k": 5.0, "theta0": 0.3}  # fmt: skip
     channels = [{k: v * factor for k, v in channel.items()} for factor in (0.8, 1, 1.1)]
@@ -220,9 +220,12 @@ def test_fits_of_the_shifted_gamma_distribution(types, tmp_path, rng):
     expected = np.stack([shifted_gamma(c, wi, wo) for c in channels], axis=1) * wo[:, 2:]
     truth = truth_of(path, types, "paint")
     np.testing.assert_allclose(values(truth, types, wi, wo), np.maximum(expected, 0), rtol=2e-4, atol=1e-6)
-    (tmp_path / "report.json").write_text("{}")
+    (tmp_path / "report.json").write_text('{"materials": {"a": {"psnr_db": 1}}}')
+    (tmp_path / "cut.json").write_text(json.dumps({"paint": fit})[:-9])
+    (tmp_path / "short.json").write_text(json.dumps({"paint": {"rhoD": fit["rhoD"]}}))
+    os.mkfifo(tmp_path / "pipe.json")
     materials, broken = materials_in(tmp_path, types)
-    assert {m.material for m in materials.values()} == {"paint", "steel"} and not broken
+    assert {m.material for m in materials.values()} == {"paint", "steel"} and set(broken) == {"cut", "short", "pipe"}
     for content, material, message in (
         (json.dumps({"paint": fit, "steel": fit}), "", r"has 2 fits: name one \(material\), they are paint, steel"),
         (json.dumps({"paint": fit}), "gold", 'found "gold", .*fits.json has no such fit'),

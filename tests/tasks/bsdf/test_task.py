@@ -18,8 +18,9 @@ from mi_diffind.core.errors import UsageError
 from mi_diffind.core.runtime import array_module
 from mi_diffind.tasks.bsdf import TASK, energy, evaluation, measured, mixture, training
 from mi_diffind.tasks.bsdf import directions as pool
+from mi_diffind.tasks.bsdf import fit as bsdf_fit
 from mi_diffind.tasks.bsdf.files import BSDFModel, allocate
-from mi_diffind.tasks.bsdf.measured import Truth, rotate_truth
+from mi_diffind.tasks.bsdf.measured import FunctionTruth, Truth, rotate_truth
 from mi_diffind.tasks.bsdf.model import TERMS, Parameter, sizes_within
 from mi_diffind.tasks.bsdf.truth import recorded_source, truth_of
 
@@ -235,25 +236,55 @@ def test_the_mixture_follows_the_source(types):
     assert mixture.second_moment(Sum(), one_lobe, types, 0.7, 2**14) > 1.3
 
 
-def test_the_albedo_is_limited(types):
-    """A BSDF that is too bright in some angles is scaled below the source + 0.1%, at other angles and samples, too."""
+def scaled_function(value, scale, types):
+    """A function times s(θ_i) s(θ_o)."""
+    array = StoredArray(scale[:, None].astype(np.float32)).allocate(types.TensorXf)
+
+    def scaled(wi, wo):
+        factor = array([dr.sqrt(wi.z)])[0] * array([dr.sqrt(wo.z)])[0]
+        return [factor * v for v in value(wi, wo)]
+
+    return scaled
+
+
+def test_the_albedo_is_limited(types, monkeypatch):
+    """A BSDF that is too bright in some angles is scaled below the source + 0.1%, by random numbers, too."""
     truth = FormulaTruth()
 
     def bright(wi, wo):
         factor = 1 + 0.06 * dr.exp(-dr.square((wi.z - 0.5) / 0.1)) * (1 + wo.z)
         return [factor * v for v in truth.value(wi, wo)]
 
-    scale = energy.fit_scale(bright, truth, types)
-    array = StoredArray(scale[:, None].astype(np.float32)).allocate(types.TensorXf)
-
-    def scaled(wi, wo):
-        factor = array([dr.sqrt(wi.z)])[0] * array([dr.sqrt(wo.z)])[0]
-        return [factor * v for v in bright(wi, wo)]
-
+    scaled = scaled_function(bright, energy.fit_scale(bright, truth, types), types)
+    monkeypatch.setattr(energy, "KroneckerSequence", lambda size: dr.rng(seed=dr.opaque(types.UInt64, 77)))
     cos = np.cos(np.radians(np.linspace(0, 88.5, 50)))
-    source, before, after = energy.albedos([truth.value, bright, scaled], truth, types, cos, size=50_000)
+    source, before, after = energy.albedos([truth.value, bright, scaled], truth, types, cos)
     assert (before / source).max() > 1.08
     assert (after / source).max() < 1.001 and (after / source).min() > 0.9
+
+
+def test_the_albedo_is_at_most_1(types):
+    """A Lambertian source of albedo 1.3 is limited to 1; that of albedo 1 has it, by the integral itself."""
+    bright, white = (FunctionTruth("", lambda wi, wo, a=a: [a / math.pi * wo.z] * 3) for a in (1.3, 1.0))
+    scaled = scaled_function(bright.value, energy.fit_scale(bright.value, bright, types), types)
+    cos = np.cos(np.radians(np.linspace(0, 88.5, 20)))
+    limited, exact = energy.albedos([scaled, white.value], white, types, cos)
+    assert 0.98 < limited.max() < 1.002 and abs(exact - 1).max() < 2e-3
+
+
+def test_assumed_symmetry(types):
+    """Isotropic functions count as symmetric about the plane of incidence up to 10%, rows and others up to 1%."""
+    for isotropy, mirror, rows, expected in (
+        (0, 0.05, False, (True, "mirror")), (0, 0.2, False, (True, "half")),
+        (0, 0.05, True, (True, "half")), (0.5, 0.05, False, (False, "half")), (0.5, None, False, (False, "mirror")),
+    ):  # fmt: skip
+        assert bsdf_fit._assumed_symmetry({"isotropy": isotropy, "mirror": mirror}, rows) == expected
+    irreciprocal = FormulaTruth(exchange=0.3)
+    symmetries = measured.measure_symmetry(irreciprocal, types, 2**14)
+    fitted = measured.fitted_part(irreciprocal, symmetries, True)
+    assert measured.measure_symmetry(fitted, types, 2**14)["reciprocity"] < 1e-3 < symmetries["reciprocity"]
+    symmetric = FormulaTruth()
+    assert measured.fitted_part(symmetric, measured.measure_symmetry(symmetric, types, 2**14), True) is symmetric
 
 
 # -- files and training ------------------------------------------------------------------------------------------------
